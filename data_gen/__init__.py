@@ -1,0 +1,1 @@
+"""Recipes for the data that the package ships."""

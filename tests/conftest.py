@@ -1,0 +1,87 @@
+"""What several test files share: the folder of real data, and a writer of tensor files."""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8")
+
+
+def find_shared_data() -> Path:
+    """The folder of real data, ``../shared/data`` of the repository or TRAITBRDF_SHARED.
+
+    Without it a test is skipped, save where CI=true: there a missing folder is a failure, or the
+    checks against real data could vanish unseen.
+    """
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("TRAITBRDF_SHARED", default))
+    if not folder.is_dir():
+        reason = f"needs the real data at {folder} (set TRAITBRDF_SHARED to where they are)"
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return folder
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    return find_shared_data()
+
+
+def write_tensor(path: Path, fields: Mapping[str, Any]) -> Path:
+    """Write a tensor file (.bsdf): header and table first, then the arrays, 8-byte aligned."""
+    arrays = {name: np.asarray(value) for name, value in fields.items()}
+    offset = 18 + sum(13 + len(name) + 8 * a.ndim for name, a in arrays.items())
+    table, body = b"", b""
+    for name, array in arrays.items():
+        body += bytes(-(offset + len(body)) % 8)
+        table += struct.pack("<H", len(name)) + name.encode()
+        kind = _TYPES.index(array.dtype.str[1:]) + 1
+        table += struct.pack("<HBQ", array.ndim, kind, offset + len(body))
+        table += struct.pack(f"<{array.ndim}Q", *array.shape)
+        body += array.tobytes()
+    path.write_bytes(b"tensor_file\0\1\0" + struct.pack("<I", len(arrays)) + table + body)
+    return path
+
+
+@pytest.fixture
+def tensor_writer() -> Callable[[Path, Mapping[str, Any]], Path]:
+    return write_tensor
+
+
+@pytest.fixture
+def rgl_fields() -> dict[str, Any]:
+    """The fields of a small RGL material: a Lambert surface of albedo (0.8, 0.4, 0.1).
+
+    The warp is the identity, so the stored f cos(theta_o) is tabulated over
+    u = sqrt(2 theta_m / pi) and the azimuth of the half vector directly.
+    """
+    n = 96
+    theta_i = np.radians(np.linspace(0.0, 90.0, 46))
+    u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    theta_m, phi_m = u * u * math.pi / 2, (2 * v - 1) * math.pi
+    ti = theta_i[:, None, None]
+    dot = np.sin(ti) * np.sin(theta_m) * np.cos(phi_m) + np.cos(ti) * np.cos(theta_m)
+    cos_o = 2 * dot * np.cos(theta_m) - np.cos(ti)
+    albedo = np.array([0.8, 0.4, 0.1])[:, None, None]
+    luminance = (cos_o / math.pi)[None].astype(np.float32)
+    return {
+        "description": np.frombuffer(b"a test material", np.uint8),
+        "phi_i": np.zeros(1, np.float32),
+        "theta_i": theta_i.astype(np.float32),
+        "sigma": np.ones((2, 4), np.float32),
+        "ndf": np.ones((2, 4), np.float32),
+        "vndf": np.ones((1, len(theta_i), 8, 8), np.float32),
+        "luminance": luminance,
+        "rgb": (luminance[:, :, None] * albedo).astype(np.float32),
+        "jacobian": np.zeros(1, np.uint8),
+        "version": np.array([1, 0], np.uint32),
+    }

@@ -1,0 +1,166 @@
+"""Unit directions, shading frames, half/difference angles and the lat-long sphere.
+
+Conventions of the whole package, stated here once:
+
+- ``wi`` points to the light and ``wo`` to the viewer; both are unit vectors of shape
+  ``(..., 3)``. In a *local* frame +z is the surface normal.
+- Half/difference angles follow Rusinkiewicz, "A New Change of Variables for Efficient BRDF
+  Representation" (1998): ``h`` is the normalised sum of ``wi`` and ``wo``; ``theta_h`` in
+  [0, pi/2] is its angle to the normal; ``theta_d`` in [0, pi/2] and ``phi_d`` are the polar angles
+  of ``wi`` in the frame whose z axis is ``h`` and whose x axis lies in the plane of ``h`` and the
+  normal, pointing away from the normal. Radians everywhere.
+- Angles come from ``atan2``, never ``acos``: in float32 ``acos`` loses everything below 2e-4 rad,
+  which is the first node of a MERL table.
+- The world is y up. A lat-long image has row 0 at the top (+y); its centre is -z and right of the
+  centre is +x (right-handed).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+def as_directions(value: ArrayLike, name: str) -> Array:
+    """Return `value` as a floating ``(..., 3)`` array of unit vectors.
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not 3, a component is not finite, or a vector is not of unit length
+        within 1e-3.
+    """
+    w = np.asarray(value)
+    if not np.issubdtype(w.dtype, np.floating):
+        w = w.astype(np.float64)
+    if w.ndim == 0 or w.shape[-1] != 3:
+        raise ValueError(f"{name}: expected directions of shape (..., 3), got shape {w.shape}")
+    length = np.sqrt(np.sum(w * w, axis=-1))
+    if not np.all(np.abs(length - 1.0) < 1e-3):  # NaN fails this as well
+        raise ValueError(
+            f"{name}: expected unit vectors, got lengths from {np.min(length):.6g} "
+            f"to {np.max(length):.6g}"
+        )
+    return w
+
+
+def half_diff_angles(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
+    """Half/difference angles of direction pairs in the local frame.
+
+    Parameters
+    ----------
+    wi, wo : (..., 3) array
+        Unit directions to the light and to the viewer, +z the normal.
+
+    Returns
+    -------
+    theta_h, theta_d, phi_d : (...) arrays
+        Radians; ``theta_h`` in [0, pi], ``theta_d`` in [0, pi/2], ``phi_d`` in (-pi, pi].
+        For ``wi == -wo`` the half vector is undefined and taken to be the normal.
+    """
+    total = wi + wo
+    length = np.sqrt(np.sum(total * total, axis=-1))
+    difference = wi - wo
+    theta_d = np.arctan2(np.sqrt(np.sum(difference * difference, axis=-1)), length)
+    degenerate = length == 0.0
+    h = total / np.where(degenerate, 1.0, length)[..., None]
+    h = np.where(degenerate[..., None], np.array([0.0, 0.0, 1.0], dtype=h.dtype), h)
+    sin_h = np.hypot(h[..., 0], h[..., 1])
+    theta_h = np.arctan2(sin_h, h[..., 2])
+    on_axis = sin_h == 0.0
+    safe = np.where(on_axis, 1.0, sin_h)
+    cos_phi = np.where(on_axis, 1.0, h[..., 0] / safe)
+    sin_phi = np.where(on_axis, 0.0, h[..., 1] / safe)
+    x = h[..., 2] * (cos_phi * wi[..., 0] + sin_phi * wi[..., 1]) - sin_h * wi[..., 2]
+    y = cos_phi * wi[..., 1] - sin_phi * wi[..., 0]
+    return theta_h, theta_d, np.arctan2(y, x)
+
+
+def from_half_diff_angles(
+    theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike, phi_h: ArrayLike = 0.0
+) -> tuple[Array, Array]:
+    """Directions ``wi, wo`` of shape (..., 3) with the given half/difference angles (radians).
+
+    The inverse of `half_diff_angles`; `phi_h` turns the pair about the normal.
+    """
+    th, td, pd = np.broadcast_arrays(theta_h, theta_d, phi_d)
+    if not np.issubdtype(th.dtype, np.floating):
+        th = th.astype(np.float64)
+    ph = np.asarray(phi_h, dtype=th.dtype)
+    th, td, pd, ph = np.broadcast_arrays(th, td, pd, ph)
+    sh, ch = np.sin(th), np.cos(th)
+    sp, cp = np.sin(ph), np.cos(ph)
+    h = np.stack([sh * cp, sh * sp, ch], axis=-1)
+    x = np.stack([ch * cp, ch * sp, -sh], axis=-1)
+    y = np.stack([-sp, cp, np.zeros_like(cp)], axis=-1)
+    along = np.cos(td)[..., None] * h
+    across = np.sin(td)[..., None] * (np.cos(pd)[..., None] * x + np.sin(pd)[..., None] * y)
+    return along + across, along - across
+
+
+def fold_phi_d(phi_d: Array) -> Array:
+    """Fold ``phi_d`` to [0, pi/2], by reciprocity (period pi) and mirror symmetry."""
+    folded = np.mod(phi_d, math.pi)
+    return np.minimum(folded, math.pi - folded)
+
+
+def shading_frame(normal: Array) -> tuple[Array, Array]:
+    """Two unit tangents (..., 3) that complete unit normals (..., 3) to a right-handed frame.
+
+    Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017), listing 3: no branch
+    that loses precision near the poles.
+    """
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangent = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    bitangent = np.stack([b, sign + y * y * a, -y], axis=-1)
+    return tangent, bitangent
+
+
+def to_local(w: Array, normal: Array) -> Array:
+    """World directions (..., 3) in the local frames of unit normals (..., 3)."""
+    tangent, bitangent = shading_frame(normal)
+    return np.stack(
+        [np.sum(w * tangent, -1), np.sum(w * bitangent, -1), np.sum(w * normal, -1)], axis=-1
+    )
+
+
+def to_world(w: Array, normal: Array) -> Array:
+    """Local directions (..., 3) of the frames of unit normals (..., 3) in the world."""
+    tangent, bitangent = shading_frame(normal)
+    return w[..., :1] * tangent + w[..., 1:2] * bitangent + w[..., 2:3] * normal
+
+
+def reflect(w: Array, normal: Array) -> Array:
+    """Mirror unit directions (..., 3) about unit normals (..., 3)."""
+    return 2.0 * np.sum(w * normal, axis=-1, keepdims=True) * normal - w
+
+
+def latlong_to_direction(u: ArrayLike, v: ArrayLike) -> Array:
+    """World directions (..., 3) at the lat-long image position (u, v).
+
+    `u` in [0, 1] runs from left to right, `v` in [0, 1] from the top (+y) to the bottom. This is
+    Ramamoorthi & Hanrahan's mapping x = -sin(theta) sin(phi), y = -cos(theta),
+    z = sin(theta) cos(phi), whose theta = pi (1 - v) counts from -y and whose phi = 2 pi u.
+    """
+    uu, vv = np.broadcast_arrays(
+        np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
+    )
+    phi, polar = 2.0 * math.pi * uu, math.pi * vv
+    s = np.sin(polar)
+    return np.stack([-s * np.sin(phi), np.cos(polar), s * np.cos(phi)], axis=-1)
+
+
+def direction_to_latlong(w: ArrayLike) -> tuple[Array, Array]:
+    """Lat-long image position (u, v) of world directions (..., 3), both in [0, 1]."""
+    d = np.asarray(w)
+    u = (np.arctan2(d[..., 0], -d[..., 2]) + math.pi) / (2.0 * math.pi)
+    v = np.arctan2(np.hypot(d[..., 0], d[..., 2]), d[..., 1]) / math.pi
+    return u, v
