@@ -7,6 +7,7 @@ interpolates f linearly in the three angles, so that radiance is linear in the t
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -156,8 +157,9 @@ class HalfDiffGrid:
             np.asarray(phi_d, np.float64),
         )
         i0, i1, fi = self._bracket_theta_h(th)
-        j0, j1, fj = _bracket_uniform(td * (self._last(self.n_theta_d) / (math.pi / 2)),
-                                      self.n_theta_d)
+        j0, j1, fj = _bracket_uniform(
+            td * (self._last(self.n_theta_d) / (math.pi / 2)), self.n_theta_d
+        )
         if self.layout == "merl":
             x = np.mod(pd, math.pi) * (self.n_phi_d / math.pi)
             base = np.floor(x)
@@ -166,7 +168,8 @@ class HalfDiffGrid:
             fl = x - base
         else:
             l0, l1, fl = _bracket_uniform(
-                fold_phi_d(pd) * ((self.n_phi_d - 1) / (math.pi / 2)), self.n_phi_d
+                np.asarray(fold_phi_d(pd) * ((self.n_phi_d - 1) / (math.pi / 2)), np.float64),
+                self.n_phi_d,
             )
         index = np.empty((*th.shape, 8), np.int64)
         weight = np.empty((*th.shape, 8), np.float64)
@@ -262,11 +265,16 @@ class TabulatedBRDF:
         """
         values = formats.read_merl(path)
         n_h, n_d, n_p, _ = values.shape
+        if min(n_h, n_d, n_p) < 2:
+            raise formats.FormatError(path, "2 nodes an axis", f"{n_h} x {n_d} x {n_p}")
         grid = HalfDiffGrid(n_h, n_d, n_p, "merl")
         return cls(grid, np.maximum(values, 0.0), name=formats.stem(path))
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write a MERL ``.binary`` file, on the 90 x 90 x 180 grid of that format."""
+        """Write a MERL ``.binary`` file, on the 90 x 90 x 180 grid of that format.
+
+        The format has no place for `mirror`: it is not written.
+        """
         formats.write_merl(path, self.regrid(HalfDiffGrid.merl()).values)
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
@@ -356,7 +364,7 @@ def hemisphere_nodes(
     wh = ((high - low) * 0.5 * wx[:, None]).T.ravel()
     so, co = math.sin(theta_o), math.cos(theta_o)
     # wi.n = 2 (wo.h) cos(theta_h) - cos(theta_o) > 0 bounds cos(phi_h) from below
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         bound = (co / (2.0 * np.cos(th)) - co * np.cos(th)) / (so * np.sin(th))
     bound = np.where(np.isnan(bound), -np.inf, bound)
     phi_max = np.arccos(np.clip(bound, -1.0, 1.0))
@@ -371,7 +379,12 @@ def hemisphere_nodes(
     weight = wh[:, None] * w_phi * sh * 4.0 * np.maximum(wo_h, 0.0) * np.maximum(wi[..., 2], 0.0)
     _, td, pd = half_diff_angles(wi, np.broadcast_to(wo, wi.shape))
     thetas = np.broadcast_to(th[:, None], phi.shape)
-    return thetas.ravel(), td.ravel(), pd.ravel(), weight.ravel()
+    return (
+        thetas.ravel(),
+        np.asarray(td, np.float64).ravel(),
+        np.asarray(pd, np.float64).ravel(),
+        np.asarray(weight, np.float64).ravel(),
+    )
 
 
 def albedo_operator(grid: HalfDiffGrid, theta_o: ArrayLike) -> scipy.sparse.csr_array:
@@ -379,10 +392,15 @@ def albedo_operator(grid: HalfDiffGrid, theta_o: ArrayLike) -> scipy.sparse.csr_
     angles = np.atleast_1d(np.asarray(theta_o, np.float64))
     if angles.ndim != 1 or not np.all((angles >= 0.0) & (angles < math.pi / 2)):
         raise ValueError("theta_o: expected angles in [0, pi/2) radians")
+    return _albedo_rows(grid, tuple(angles.tolist()))
+
+
+@functools.lru_cache(maxsize=16)
+def _albedo_rows(grid: HalfDiffGrid, angles: tuple[float, ...]) -> scipy.sparse.csr_array:
     nodes = np.unique(np.append(grid.theta_h, math.pi / 2))
     rows = []
     for theta in angles:
-        th, td, pd, weight = hemisphere_nodes(float(theta), nodes)
+        th, td, pd, weight = hemisphere_nodes(theta, nodes)
         index, corner = grid.stencil(th, td, pd)
         row = np.bincount(
             index.ravel(), weights=(weight[:, None] * corner).ravel(), minlength=grid.size

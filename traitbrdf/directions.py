@@ -40,7 +40,8 @@ def as_directions(value: ArrayLike, name: str) -> Array:
         w = w.astype(np.float64)
     if w.ndim == 0 or w.shape[-1] != 3:
         raise ValueError(f"{name}: expected directions of shape (..., 3), got shape {w.shape}")
-    length = np.sqrt(np.sum(w * w, axis=-1))
+    with np.errstate(over="ignore"):  # an infinite length is refused below
+        length = np.sqrt(np.sum(w * w, axis=-1))
     if not np.all(np.abs(length - 1.0) < 1e-3):  # NaN fails this as well
         raise ValueError(
             f"{name}: expected unit vectors, got lengths from {np.min(length):.6g} "
@@ -140,7 +141,8 @@ def to_world(w: Array, normal: Array) -> Array:
 
 def reflect(w: Array, normal: Array) -> Array:
     """Mirror unit directions (..., 3) about unit normals (..., 3)."""
-    return 2.0 * np.sum(w * normal, axis=-1, keepdims=True) * normal - w
+    mirrored: Array = 2.0 * np.sum(w * normal, axis=-1, keepdims=True) * normal - w
+    return mirrored
 
 
 def latlong_to_direction(u: ArrayLike, v: ArrayLike) -> Array:
@@ -150,9 +152,7 @@ def latlong_to_direction(u: ArrayLike, v: ArrayLike) -> Array:
     Ramamoorthi & Hanrahan's mapping x = -sin(theta) sin(phi), y = -cos(theta),
     z = sin(theta) cos(phi), whose theta = pi (1 - v) counts from -y and whose phi = 2 pi u.
     """
-    uu, vv = np.broadcast_arrays(
-        np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
-    )
+    uu, vv = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     phi, polar = 2.0 * math.pi * uu, math.pi * vv
     s = np.sin(polar)
     return np.stack([-s * np.sin(phi), np.cos(polar), s * np.cos(phi)], axis=-1)

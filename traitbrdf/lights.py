@@ -7,6 +7,7 @@ solid angle, in every code path, so that two integrators can be compared to the 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,9 +48,10 @@ class PointLight:
         offset = np.asarray(self.position) - points
         squared = np.sum(offset * offset, axis=-1, keepdims=True)
         # at the light itself there is no direction: no light there rather than infinity
-        safe = np.where(squared > 0.0, squared, 1.0)
-        irradiance = np.where(squared > 0.0, np.asarray(self.intensity) / safe, 0.0)
-        direction = np.where(squared > 0.0, offset / np.sqrt(safe), (0.0, 1.0, 0.0))
+        apart = squared > 1e-200
+        safe = np.where(apart, squared, 1.0)
+        irradiance = np.where(apart, np.asarray(self.intensity) / safe, 0.0)
+        direction = np.where(apart, offset / np.sqrt(safe), (0.0, 1.0, 0.0))
         return direction, irradiance
 
 
@@ -68,10 +70,11 @@ class DirectionalLight:
 
     def __post_init__(self) -> None:
         raw = _triple(self.direction, "direction")
-        length = math.sqrt(sum(c * c for c in raw))
-        if length == 0.0:
+        largest = max(abs(c) for c in raw)
+        if largest == 0.0:
             raise ValueError("direction: expected a vector of non-zero length, got (0, 0, 0)")
-        unit = tuple(c / length for c in raw)
+        scaled = tuple(c / largest for c in raw)  # the squares neither over- nor underflow
+        unit = tuple(c / math.hypot(*scaled) for c in scaled)
         object.__setattr__(self, "direction", unit)
         object.__setattr__(self, "irradiance", _triple(self.irradiance, "irradiance", low=0.0))
 
@@ -124,16 +127,12 @@ class EnvironmentMap:
             raise TypeError(f"radiance: expected real numbers, got dtype {image.dtype}")
         with np.errstate(over="ignore"):
             image = np.ascontiguousarray(image, dtype=np.float32)
-        if not np.isfinite(image).all():
-            bad = int(np.count_nonzero(~np.isfinite(image)))
-            raise ValueError(f"radiance: expected finite float32 values, got {bad} that are not")
-        if image.min() < 0.0:
-            raise ValueError(
-                f"radiance: expected no negative values, got {np.count_nonzero(image < 0)} "
-                f"with a minimum of {image.min():.6g}"
-            )
+        if fault := _fault(image):
+            raise ValueError("radiance: expected {}, got {}".format(*fault))
         if not math.isfinite(rotation):
             raise ValueError(f"rotation: expected a finite angle in radians, got {rotation!r}")
+        if image.flags.writeable and np.may_share_memory(image, radiance):
+            image = image.copy()  # what is frozen below is not the caller's array
         self.image = image
         self.image.flags.writeable = False
         self.rotation = float(rotation)
@@ -169,14 +168,10 @@ class EnvironmentMap:
             )
         image = formats.read_image(path)
         ringing = _ringing(image)
-        try:
-            if layout == "latlong":
-                result = cls(np.where(ringing, 0.0, image))
-            else:
-                cls(np.where(ringing, 0.0, image))
-                result = cls(_unwrap_probe(np.maximum(image, 0.0), layout))
-        except ValueError as error:
-            raise formats.FormatError(f"{path}: {error}") from error
+        image = np.where(ringing, np.float32(0.0), image)
+        if fault := _fault(image):
+            raise formats.FormatError(path, *fault)
+        result = cls(image if layout == "latlong" else _unwrap_probe(image, layout))
         result.clipped_texels = int(np.count_nonzero(ringing.any(-1)))
         return result
 
@@ -211,7 +206,7 @@ class EnvironmentMap:
             indexing="ij",
         )  # fmt: skip
         w = latlong_to_direction(u, v)
-        height = w[..., 1:]
+        height = w[..., 1:2]
         horizon, zenith = np.array([0.62, 0.68, 0.75]), np.array([0.14, 0.26, 0.55])
         up = np.clip(height, 0.0, 1.0) ** 0.5
         sky = horizon * (1.0 - up) + zenith * up
@@ -266,7 +261,7 @@ class EnvironmentMap:
         u, v = direction_to_latlong(self.to_map(w))
         row = np.clip((v * m).astype(np.int64), 0, m - 1)
         column = (u * n).astype(np.int64) % n
-        return self.image[row, column]
+        return np.asarray(self.image[row, column])
 
     def backdrop(self, w: ArrayLike) -> Array:
         """Radiance (..., 3), bilinear between texel centres: for what stands behind the object.
@@ -287,7 +282,7 @@ class EnvironmentMap:
         moment = texel_moments(self).reshape(-1, 3)
         energy = self.image.reshape(-1, 3).astype(np.float64)
         flat = n.reshape(-1, 3)
-        result = np.empty_like(flat)
+        result = np.empty(flat.shape)
         for i in range(0, len(flat), 64):
             result[i : i + 64] = np.maximum(flat[i : i + 64] @ moment.T, 0.0) @ energy
         return result.reshape(n.shape)
@@ -322,11 +317,20 @@ def turn_about_y(w: Array, angle: float) -> Array:
     )
 
 
+def _fault(image: NDArray[np.float32]) -> tuple[str, str] | None:
+    """What is expected of radiance (M, N, 3) and what it is instead; None where all is well."""
+    bad = int(np.count_nonzero(~np.isfinite(image)))
+    if bad:
+        return "finite float32 radiance", f"{bad} values that are not"
+    bad = int(np.count_nonzero(image < 0.0))
+    if bad:
+        return "radiance that is not negative", f"{bad} values down to {image.min():.6g}"
+    return None
+
+
 def _ringing(image: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask (M, N, 3) of negative values that look like the undershoot of a resampling filter."""
-    brightest = scipy.ndimage.maximum_filter(
-        image.max(axis=-1), size=7, mode=("nearest", "wrap")
-    )
+    brightest = scipy.ndimage.maximum_filter(image.max(axis=-1), size=7, mode=("nearest", "wrap"))
     mask: NDArray[np.bool_] = (image < 0.0) & (-image <= 0.25 * brightest[..., None])
     return mask
 
@@ -346,7 +350,7 @@ def _bilinear(image: NDArray[np.float32], x: Array, y: Array, wrap: bool) -> Arr
 
 
 def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
-    """A probe image (angular map or mirror ball) resampled to a lat-long map of its height."""
+    """A probe image (angular map or mirror ball) resampled to a lat-long map of half its height."""
     size_y, size_x, _ = image.shape
     rows = max(size_y // 2, 1)
     v, u = np.meshgrid(
@@ -368,21 +372,24 @@ def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
 class LightTree:
     """An environment map as a binary tree of lat-long rectangles, the root first.
 
-    A node's `flux` and `direction` reproduce the vector irradiance of its light exactly (the
-    direction is the centroid of its radiance), so a node stands in for its texels to first order.
-    Rectangles without light are left out.
+    A node's `moment` is the exact vector irradiance of its light, colour by colour, so that a
+    Lambert surface sees no difference between a node and its texels; `direction` and `spread` are
+    the mean and the standard deviation of where that light comes from. Rectangles without light
+    are left out.
 
     Attributes
     ----------
-    flux : (n, 3) float32, integral of radiance over the rectangle, times the centroid's length
+    moment : (n, 3, 3) float32, integral of radiance (first axis: colour) times direction
     direction : (n, 3) float32 unit, in the map's frame
-    radius : (n,) float32, half the rectangle's diagonal in radians
+    spread : (n,) float32, standard deviation about the centroid along one axis, radians
+    radius : (n,) float32, half the rectangle's diagonal, radians
     child : (n, 2) int32, indices of the halves; -1 where there is none
     rectangle : (n, 4) int32: first and last + 1 row, first and last + 1 column
     """
 
-    flux: NDArray[np.float32]
+    moment: NDArray[np.float32]
     direction: NDArray[np.float32]
+    spread: NDArray[np.float32]
     radius: NDArray[np.float32]
     child: NDArray[np.int32]
     rectangle: NDArray[np.int32]
@@ -420,42 +427,40 @@ class LightTree:
         box = np.concatenate(levels)
         child = np.concatenate(children)
         # sums run from the leaves up, so that a dim sky survives beside a bright sun
-        flux = np.zeros((len(box), 3))
-        moment = np.zeros((len(box), 3))
-        weight = np.zeros(len(box))
+        moment = np.zeros((len(box), 3, 3))
+        flux = np.zeros(len(box))
         leaf = child[:, 0] < 0
         at = box[leaf, 0], box[leaf, 2]
         texel = environment.image[at].astype(np.float64)
-        omega = environment.solid_angles[box[leaf, 0]]
-        flux[leaf] = texel * omega[:, None]
-        weight[leaf] = flux[leaf].sum(-1)
-        moment[leaf] = texel_moments(environment)[at] * texel.sum(-1, keepdims=True)
+        flux[leaf] = texel.sum(-1) * environment.solid_angles[box[leaf, 0]]
+        moment[leaf] = texel[:, :, None] * texel_moments(environment)[at][:, None, :]
         starts = np.concatenate([[0], np.cumsum([len(level) for level in levels])])
-        for start, stop in reversed(list(zip(starts[:-1], starts[1:], strict=True))):
+        for start, stop in reversed(list(itertools.pairwise(starts))):
             inner = np.flatnonzero(child[start:stop, 0] >= 0) + start
             for side in (0, 1):
-                flux[inner] += flux[child[inner, side]]
                 moment[inner] += moment[child[inner, side]]
-                weight[inner] += weight[child[inner, side]]
-        length = np.linalg.norm(moment, axis=-1)
-        lit = (weight > 0.0) & (length > 0.0)
-        shorter = np.where(lit, length / np.where(weight > 0, weight, 1.0), 1.0)
-        unit = np.where(lit[:, None], moment / np.where(lit, length, 1.0)[:, None], (0, 1, 0))
-        dark = weight <= 0.0
-        child = np.where((child >= 0) & dark[child], -1, child)
+                flux[inner] += flux[child[inner, side]]
+        white = moment.sum(axis=1)
+        length = np.linalg.norm(white, axis=-1)
+        lit = flux > 0.0
+        # the mean of unit vectors is shorter than one by their variance about it
+        mean_length = np.where(lit, length / np.where(lit, flux, 1.0), 1.0)
+        spread = np.sqrt(np.maximum(1.0 - mean_length**2, 0.0) / 2.0)
+        known = lit & (length > 0.0)
+        unit = np.where(known[:, None], white / np.where(known, length, 1.0)[:, None], (0, 1, 0))
+        child = np.where((child >= 0) & ~lit[child], -1, child)
         height, width = _extent(box, edges, n)
         return cls(
-            (flux * shorter[:, None]).astype(np.float32),
+            moment.astype(np.float32),
             unit.astype(np.float32),
+            spread.astype(np.float32),
             (0.5 * np.hypot(height, width)).astype(np.float32),
             child.astype(np.int32),
             box.astype(np.int32),
         )
 
 
-def _extent(
-    box: NDArray[np.int64], edges: Float64, columns: int
-) -> tuple[Float64, Float64]:
+def _extent(box: NDArray[np.int64], edges: Float64, columns: int) -> tuple[Float64, Float64]:
     """Angular height and greatest width of rectangles (n, 4), radians."""
     top, bottom = edges[box[:, 0]], edges[box[:, 1]]
     widest = np.where(

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.directions import half_diff_angles, reflect, to_local
-from traitbrdf.lights import EnvironmentMap, Light
+from traitbrdf.lights import EnvironmentMap, Light, PointLight
 from traitbrdf.scene import Scene
 
 Float64 = NDArray[np.float64]
 
 _COARSEST = 0.2
-_MAX_CELLS = 4_000_000
+_MAX_CELLS = 1_000_000
+_CHUNK = 1 << 17
+_GAUSS = 0.5 / math.sqrt(3.0)  # the two Gauss-Legendre points, from the middle, in widths
 
 
 class IntegrationError(RuntimeError):
@@ -63,22 +65,22 @@ def radiance(
     """
     count = len(normals)
     if positions is None:
-        if any(not hasattr(light, "direction") for light in lights):
+        if any(isinstance(light, PointLight) for light in lights):
             raise ValueError("positions: point lights need the (n, 3) positions of the points")
         positions = np.zeros((count, 3))
     result = np.zeros((count, len(brdfs), 3))
     error = np.zeros_like(result)
-    evaluate = _evaluator(brdfs)
+    evaluate = _Evaluator(brdfs)
     for p in range(count):
         n, v = normals[p], views[p]
         if environment is not None:
             result[p], error[p] = _converge(environment, n, v, evaluate, tolerance, p)
             mirror_light = environment.radiance(reflect(v, n)).astype(np.float64)
             result[p] += np.stack([b.mirror for b in brdfs]) * mirror_light
-        wo = to_local(v, n)
+        wo = np.asarray(to_local(v, n), np.float64)
         for light in lights:
             toward, irradiance = light.arriving(positions[p : p + 1])
-            wi = to_local(toward, n[None])
+            wi = np.asarray(to_local(toward, n[None]), np.float64)
             cos = np.maximum(wi[:, 2], 0.0)
             result[p] += evaluate(wi, wo, irradiance * cos[:, None])
     return result, error
@@ -159,9 +161,6 @@ class _Evaluator:
         return result
 
 
-_evaluator = _Evaluator
-
-
 def _converge(
     environment: EnvironmentMap,
     normal: Float64,
@@ -170,13 +169,13 @@ def _converge(
     tolerance: float,
     pixel: int,
 ) -> tuple[Float64, Float64]:
-    n, v = environment.to_map(normal), environment.to_map(view)
-    wo = to_local(v, n)
+    n = np.asarray(environment.to_map(normal), np.float64)
+    v = np.asarray(environment.to_map(view), np.float64)
     resolution = _COARSEST
-    previous = _integrate(environment, n, v, wo, evaluate, resolution)
+    previous = _integrate(environment, n, v, evaluate, resolution)
     while True:
         resolution *= 0.5
-        current = _integrate(environment, n, v, wo, evaluate, resolution)
+        current = _integrate(environment, n, v, evaluate, resolution)
         if current is None or previous is None:
             raise IntegrationError(f"point {pixel}: more than {_MAX_CELLS} cells needed")
         error = np.abs(current - previous)
@@ -190,61 +189,84 @@ def _integrate(
     environment: EnvironmentMap,
     n: Float64,
     v: Float64,
-    wo: Float64,
     evaluate: _Evaluator,
     resolution: float,
 ) -> Float64 | None:
-    """The integral with cells no larger than `resolution` times their distance from the peak."""
-    rows, columns, _ = environment.image.shape
+    """The integral with cells no larger than `resolution` times their distance from the peak.
+
+    `n` and `v` are in the map's frame. None if it takes too many cells.
+    """
+    columns = environment.image.shape[1]
     row, column = np.nonzero(environment.image.max(axis=-1) > 0.0)
     light = environment.image[row, column].astype(np.float64)
     top, bottom = environment.row_edges[row], environment.row_edges[row + 1]
     left = column * (2.0 * math.pi / columns)
     right = (column + 1) * (2.0 * math.pi / columns)
-    total = np.zeros((evaluate.count, 3))
-    whole = environment.irradiance(n).sum()
+    samples: list[tuple[Float64, Float64]] = []
     cells = 0
+    whole = -1.0  # the irradiance, texels at the horizon overrated: what cells are measured against
     while len(top):
-        middle = 0.5 * (left + right)
-        # the polar angle that halves the solid angle
-        polar = np.arccos(np.clip(np.cos(0.5 * (top + bottom)) * np.cos(0.5 * (bottom - top)), -1, 1))
-        s = np.sin(polar)
-        w = np.stack([-s * np.sin(middle), np.cos(polar), s * np.cos(middle)], axis=-1)
-        size = 0.5 * np.hypot(bottom - top, np.maximum(np.sin(top), np.sin(bottom))
-                              * (right - left))  # fmt: skip
+        polar, azimuth = 0.5 * (top + bottom), 0.5 * (left + right)
+        w = _direction(polar, azimuth)
+        # no point of the cell is further from w than this: the sphere curves inwards
+        straddles = (top < 0.5 * math.pi) & (bottom > 0.5 * math.pi)
+        widest = np.where(straddles, 1.0, np.maximum(np.sin(top), np.sin(bottom)))
+        size = 0.5 * np.hypot(bottom - top, widest * (right - left))
         cos_i = w @ n
         above = cos_i > -size
         top, bottom, left, right = top[above], bottom[above], left[above], right[above]
         light, w, size, cos_i = light[above], w[above], size[above], cos_i[above]
+        polar, azimuth = polar[above], azimuth[above]
         h = w + v
         length = np.sqrt(np.sum(h * h, axis=-1))
         h /= np.maximum(length, 1e-12)[:, None]
         cross = np.cross(h, n)
         theta_h = np.arctan2(np.sqrt(np.sum(cross * cross, axis=-1)), h @ n)
         reach = size / np.maximum(length, 0.02)  # |dh| <= |dw| / (2 cos theta_d), |wi+wo| = 2 cos
-        near = np.maximum(theta_h - reach, 0.0)
-        cut = reach > resolution * (near + 1e-4)
-        cut |= (np.abs(cos_i) < size) & (size > 0.02 * resolution)
-        band = 2.0 * np.sin(0.5 * (top + bottom)) * np.sin(0.5 * (bottom - top))
-        omega = band * (right - left)
-        share = light.sum(axis=-1) * omega * np.maximum(cos_i, 0.0) / whole
-        cut |= share > 0.25 * resolution**2  # a small bright light deserves more than one sample
-        keep = ~cut
-        local = to_local(w[keep], np.broadcast_to(n, (int(keep.sum()), 3)))
-        weight = light[keep] * (omega[keep] * np.maximum(cos_i[keep], 0.0))[:, None]
-        total += evaluate(local, wo, weight)
+        limit = resolution * (np.maximum(theta_h - reach, 0.0) + 1e-4)
+        at_horizon = np.abs(cos_i) < size
+        cut = (reach > limit) | (at_horizon & (size > 0.02 * resolution))
+        omega = 2.0 * np.sin(polar) * np.sin(0.5 * (bottom - top)) * (right - left)
+        flux = light.sum(axis=-1) * omega
+        if whole < 0.0:
+            whole = float(np.sum(flux * np.maximum(cos_i, size)))
+        # a small bright light deserves more than one sample
+        cut |= flux * np.maximum(cos_i, 0.0) > 0.25 * resolution**2 * whole
+        small = ~cut & ~at_horizon & (reach < 0.1 * limit)
+        samples.append((w[small], light[small] * (omega * cos_i)[small, None]))
+        large = ~cut & ~small
+        for across in (-_GAUSS, _GAUSS):
+            for down in (-_GAUSS, _GAUSS):
+                t = polar + down * (bottom - top)
+                share = np.sin(t) / (2.0 * np.sin(polar) * np.cos(_GAUSS * (bottom - top)))
+                point = _direction(t[large], (azimuth + across * (right - left))[large])
+                weight = (0.5 * share * omega)[large] * np.maximum(point @ n, 0.0)
+                samples.append((point, light[large] * weight[:, None]))
         cells += len(top)
         if cells > _MAX_CELLS:
             return None
-        top, bottom, left, right = top[cut], bottom[cut], left[cut], right[cut]
         light = np.tile(light[cut], (4, 1))
-        half_v, half_u = 0.5 * (top + bottom), 0.5 * (left + right)
+        top, bottom, left, right = top[cut], bottom[cut], left[cut], right[cut]
+        polar, azimuth = polar[cut], azimuth[cut]
         top, bottom = (
-            np.concatenate([top, top, half_v, half_v]),
-            np.concatenate([half_v, half_v, bottom, bottom]),
+            np.concatenate([top, top, polar, polar]),
+            np.concatenate([polar, polar, bottom, bottom]),
         )
         left, right = (
-            np.concatenate([left, half_u, left, half_u]),
-            np.concatenate([half_u, right, half_u, right]),
+            np.concatenate([left, azimuth, left, azimuth]),
+            np.concatenate([azimuth, right, azimuth, right]),
         )
+    wo = np.asarray(to_local(v, n), np.float64)
+    total = np.zeros((evaluate.count, 3))
+    if samples:
+        w, weight = (np.concatenate(part) for part in zip(*samples, strict=True))
+        for i in range(0, len(w), _CHUNK):
+            local = np.asarray(to_local(w[i : i + _CHUNK], n), np.float64)
+            total += evaluate(local, wo, weight[i : i + _CHUNK])
     return total
+
+
+def _direction(polar: Float64, azimuth: Float64) -> Float64:
+    """Map directions (m, 3) at polar angles from +y and azimuths 2 pi u."""
+    s = np.sin(polar)
+    return np.stack([-s * np.sin(azimuth), np.cos(polar), s * np.cos(azimuth)], axis=-1)

@@ -1,0 +1,247 @@
+"""Traits: directions in the embedding that mean something to a designer.
+
+Arrays only; this module knows no BRDF. A trait is a linear score on coordinates, the normal of a
+linear support vector machine between members of the library that have it and members that do not
+(Matusik et al. 2003, who label members yes, no or unclear). Scores are scaled so that the 10th
+percentile of the library has 0 and the 90th has 1.
+
+A move changes scores by given amounts, holds others, and takes among all ways to do so the one
+that is shortest measured by the library's covariance: the one most like what real materials do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.svm import SVC
+
+Float64 = NDArray[np.float64]
+
+GROUPS = {"colour": ("red", "green", "blue"), "color": ("red", "green", "blue")}
+"""Names that stand for several traits where traits are held."""
+
+_RIDGE = 1e-3  # of the mean variance: keeps the metric regular where the library is flat
+
+
+class TraitSpace:
+    """Scores and moves of the traits of one embedding.
+
+    Parameters
+    ----------
+    names : t trait names
+    normals : (t, k) array
+        Gradient of each raw score.
+    typical : (t, 2) array
+        Raw scores of the library's 10th and 90th percentile.
+    covariance : (k, k) array, of the library's coordinates
+    low, high : (k,) arrays, the gamut box
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        normals: ArrayLike,
+        typical: ArrayLike,
+        covariance: ArrayLike,
+        low: ArrayLike,
+        high: ArrayLike,
+    ) -> None:
+        self.names = tuple(names)
+        self.normals = np.asarray(normals, np.float64)
+        self.typical = np.asarray(typical, np.float64)
+        self.covariance = np.asarray(covariance, np.float64)
+        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        t, k = len(self.names), len(self.low)
+        expected = {"normals": (t, k), "typical": (t, 2), "covariance": (k, k), "high": (k,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                got = getattr(self, name).shape
+                raise ValueError(f"{name}: expected shape {shape}, got {got}")
+        span = self.typical[:, 1] - self.typical[:, 0]
+        if not np.all(span > 0.0):
+            raise ValueError("typical: expected the 90th percentile above the 10th for each trait")
+        self._gradient = self.normals / span[:, None]
+        self._offset = -self.typical[:, 0] / span
+        ridge = _RIDGE * np.trace(self.covariance) / k
+        self._metric = self.covariance + ridge * np.eye(k)
+
+    @classmethod
+    def fit(
+        cls,
+        coordinates: ArrayLike,
+        labels: Mapping[str, ArrayLike],
+        low: ArrayLike,
+        high: ArrayLike,
+    ) -> TraitSpace:
+        """Trait vectors from labelled members.
+
+        Parameters
+        ----------
+        coordinates : (n, k) array_like
+        labels : for each trait (n,) values: 1 has it, -1 has it not, 0 unclear
+        low, high : (k,) gamut box
+
+        Raises
+        ------
+        ValueError
+            If a trait's labels are of one class only, or of a wrong shape.
+        """
+        z = np.asarray(coordinates, np.float64)
+        scale = np.maximum(z.std(axis=0), 1e-9)
+        normals, typical = [], []
+        for name, given in labels.items():
+            label = np.asarray(given)
+            if label.shape != (len(z),) or not np.isin(label, (-1, 0, 1)).all():
+                raise ValueError(
+                    f"labels of {name!r}: expected ({len(z)},) values of -1, 0 or 1, "
+                    f"got shape {label.shape}"
+                )
+            clear = label != 0
+            if len(np.unique(label[clear])) < 2:
+                raise ValueError(f"labels of {name!r}: expected members with and without it")
+            machine = SVC(kernel="linear", C=0.1).fit(z[clear] / scale, label[clear])
+            normal = machine.coef_[0] / scale
+            normals.append(normal)
+            typical.append(np.percentile(z @ normal, [10.0, 90.0]))
+        return cls(list(labels), normals, typical, np.cov(z.T), low, high)
+
+    def __repr__(self) -> str:
+        return f"TraitSpace({', '.join(self.names)})"
+
+    def index(self, name: str) -> int:
+        """Where a trait stands in `names`; an unknown one raises ValueError naming near ones."""
+        if name not in self.names:
+            import difflib
+
+            near = difflib.get_close_matches(str(name), self.names, n=3, cutoff=0.4)
+            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else ""
+            raise ValueError(f"unknown trait {name!r}: {hint} Known: {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def score(self, z: ArrayLike) -> dict[str, float]:
+        """Every trait's score at coordinates (k,): 0 is typically low, 1 typically high."""
+        values = self._gradient @ self._point(z) + self._offset
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def move(
+        self, z: ArrayLike, amounts: Mapping[str, float], hold: Iterable[str] = ()
+    ) -> Float64:
+        """Coordinates (k,) whose scores differ from those of `z` by `amounts`.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+        amounts : for each trait to move by how much; 1 is from typically low to typically high
+        hold : traits whose scores shall stay, or the group "colour" (red, green and blue)
+
+        Returns
+        -------
+        (k,) array inside the gamut box. Where the box ends before the change is complete, the
+        coordinates that can still move go on; where none can, the answer is the furthest point
+        reached (its `score` says how far that is). Amounts of 0 return `z` as it is.
+
+        Raises
+        ------
+        ValueError
+            On an unknown trait, an amount that is not finite, a trait both moved and held, or
+            held traits that forbid the move altogether.
+        """
+        start = self._point(z)
+        moved = {self.index(name): _amount(name, value) for name, value in amounts.items()}
+        held = self._held(hold)
+        clash = [self.names[i] for i in moved if i in held]
+        if clash:
+            raise ValueError(f"hold: {clash[0]!r} cannot be moved and held at once")
+        if all(value == 0.0 for value in moved.values()):
+            return start.copy()
+        rows = [*moved, *held]
+        a = self._gradient[rows]
+        wanted = np.array([*moved.values(), *(0.0 for _ in held)])
+        whole = _step(self._metric, a, wanted)
+        short = np.abs(a @ whole - wanted)
+        if short.max() > 1e-6 * max(1.0, np.abs(wanted).max()):
+            raise ValueError(
+                f"cannot move {sorted(amounts)} while holding {sorted(self.names[i] for i in held)}:"
+                " these scores depend on each other; hold fewer traits"
+            )
+        return self._walk(np.clip(start, self.low, self.high), a, wanted)
+
+    def _walk(self, z: Float64, a: Float64, wanted: Float64) -> Float64:
+        """Go on along the shortest step of the coordinates that are not at a wall of the box."""
+        free = np.ones(len(z), bool)
+        left = 1.0
+        while left > 1e-12 and free.any():
+            step = np.zeros_like(z)
+            step[free] = _step(self._metric[np.ix_(free, free)], a[:, free], wanted)
+            if np.abs(a @ step - wanted).max() > 1e-6 * np.abs(wanted).max():
+                break  # the free coordinates alone cannot do what is asked
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.where(step > 0.0, (self.high - z) / step, (self.low - z) / step)
+            room = np.where(step == 0.0, np.inf, np.maximum(room, 0.0))
+            way = min(left, float(room.min()))
+            z = np.clip(z + way * step, self.low, self.high)
+            left -= way
+            free &= room > way
+        return z
+
+    def _held(self, hold: Iterable[str]) -> list[int]:
+        if isinstance(hold, str):
+            hold = (hold,)
+        held: list[int] = []
+        for name in hold:
+            for member in GROUPS.get(name, (name,)):
+                if self.index(member) not in held:
+                    held.append(self.index(member))
+        return held
+
+    def _point(self, z: ArrayLike) -> Float64:
+        value = np.asarray(z, np.float64)
+        if value.shape != self.low.shape or not np.isfinite(value).all():
+            raise ValueError(
+                f"z: expected {len(self.low)} finite coordinates, got shape {value.shape}"
+            )
+        return value
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The state as plain arrays; the box belongs to the embedding."""
+        return {
+            "trait_names": np.array(self.names),
+            "trait_normals": self.normals,
+            "trait_typical": self.typical,
+            "covariance": self.covariance,
+        }
+
+    @classmethod
+    def from_arrays(cls, state: Mapping[str, NDArray[Any]]) -> TraitSpace:
+        """The inverse of `arrays`, with the box `low`, `high` of the embedding's arrays."""
+        return cls(
+            [str(n) for n in state["trait_names"]],
+            state["trait_normals"],
+            state["trait_typical"],
+            state["covariance"],
+            state["low"],
+            state["high"],
+        )
+
+
+def _step(metric: Float64, a: Float64, wanted: Float64) -> Float64:
+    """The step of least metric length with a @ step = wanted (least squares where impossible)."""
+    spread = metric @ a.T
+    solution, *_ = np.linalg.lstsq(a @ spread, wanted, rcond=1e-9)
+    return np.asarray(spread @ solution)
+
+
+def _amount(name: str, value: float) -> float:
+    try:
+        amount = float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"amount of {name!r}: expected a number, got {value!r}") from None
+    if not math.isfinite(amount):
+        raise ValueError(f"amount of {name!r}: expected a finite number, got {value!r}")
+    return amount
+
+
