@@ -13,10 +13,12 @@ square.
 *Basis* (`Transport`). Seen through one part of one scene, the BRDFs of interest span few
 dimensions. From the rows W_S of a subset S of pixels and training tables X, the SVD of the
 column-normalised W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables
-whose images W M span the frames; Q = orth(W M) is computed over all pixels, chunk by chunk, and
-C = Q_S^+ W_S by least squares on the subset, which holds several times more rows than Q has
-columns. Frame = Q (C rho). (Projecting rho on an orthonormal basis of cell space instead errs by
-tens of percent.)
+whose images W M span the frames; Q = orth(W M) is computed over all pixels, chunk by chunk.
+Frame = Q (C rho). The orthogonal choice C = Q^T W needs every row a second time; weighted least
+squares on some six times more rows than Q has columns comes within a tenth of its error, if the
+pixels with the greatest leverage in Q are among them and the rest is drawn at random (a uniform
+draw errs up to ten times as much on tables outside the training set). (Projecting rho on an
+orthonormal basis of cell space instead errs by tens of percent.)
 
 *Error*. Some more pixels, in neither the fit nor S, keep their exact rows, built at twice the
 resolution: comparing them gives every frame its measured error.
@@ -37,6 +39,18 @@ from numpy.typing import NDArray
 from traitbrdf.brdf import HalfDiffGrid
 from traitbrdf.directions import half_diff_angles, reflect, to_local
 from traitbrdf.lights import LightTree
+from traitbrdf.models import (
+    GGX,
+    AshikhminShirley,
+    BoundedPhong,
+    BoundedTorranceSparrow,
+    Lambert,
+    Model,
+    NormalizedPhong,
+    OrenNayar,
+    Sheen,
+    TorranceSparrowSimplified,
+)
 from traitbrdf.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -110,6 +124,19 @@ class Operator:
 
 
 @dataclass
+class _Draft:
+    """A part while its basis is being made."""
+
+    pixels: NDArray[np.int64]
+    basis: torch.Tensor
+    fit: NDArray[np.int64]
+    weight: Float64
+    rows: Float32
+    probes: NDArray[np.int64]
+    exact: Float32
+
+
+@dataclass
 class _PartBasis:
     """One part's compressed operator."""
 
@@ -135,6 +162,66 @@ class PartFrame:
         return self.deviation / self.level if self.level > 0.0 else self.deviation
 
 
+@dataclass(frozen=True)
+class Training:
+    """Scalar tables (cells, T) float32 that a basis is fitted to, and what each counts (T,)."""
+
+    tables: Float32
+    weight: Float64
+
+
+def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Training:
+    """What a frame has to be able to show.
+
+    The library's channels; every model family at log-spaced parameters; and copies of both under
+    smooth random fields in log f ("curve moves"), which count a tenth: measured materials are
+    no library members, and these keep their error from growing tenfold.
+
+    Parameters
+    ----------
+    library : (grid.size, n) float32, channels of library members
+    grid : HalfDiffGrid
+    seed : draws the fields
+    """
+    families: list[Model] = [Lambert(0.5)]
+    families += [OrenNayar(0.5, sigma) for sigma in (0.3, 0.9)]
+    families += [Sheen(0.5, alpha) for alpha in (0.3, 0.55, 1.0)]
+    for s in np.geomspace(2.0, 2e4, 17):
+        families += [BoundedPhong(0.5, float(s)), NormalizedPhong(0.5, float(s))]
+    for s in np.geomspace(0.007, 0.6, 17):
+        families += [
+            BoundedTorranceSparrow(0.5, float(s)),
+            TorranceSparrowSimplified(0.5, float(s)),
+        ]
+    for alpha in np.geomspace(0.005, 1.0, 17):
+        families += [GGX(float(alpha), eta, k) for eta, k in ((1.5, 0.0), (0.2, 3.0), (2.5, 4.0))]
+    for n in np.geomspace(3.0, 2e4, 12):
+        families += [AshikhminShirley(0.0, r, float(n), float(n)) for r in (0.05, 0.9)]
+    wi, wo = grid.node_directions()
+    known = [library] + [m.eval(wi, wo)[..., 1].reshape(-1, 1) for m in families]
+    plain = np.concatenate(known, axis=1).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(plain.shape[1], 300)
+    fields = _smooth_fields(grid, len(chosen), rng)
+    varied = plain[:, chosen] * np.exp(fields)
+    weight = np.concatenate([np.ones(plain.shape[1]), np.full(len(chosen), 0.1)])
+    return Training(np.concatenate([plain, varied], axis=1), weight)
+
+
+def _smooth_fields(grid: HalfDiffGrid, count: int, rng: np.random.Generator) -> Float32:
+    """(cells, count) random sums of low cosines over the table, of amplitude about 1."""
+    u = np.sqrt(grid.theta_h / (math.pi / 2))
+    v = grid.theta_d / (math.pi / 2)
+    waves = [
+        np.einsum("i,j,l->ijl", np.cos(math.pi * a * u), np.cos(math.pi * b * v),
+                  np.cos(2 * c * grid.phi_d)).ravel() / (1.0 + a + 1.5 * b + 2.0 * c)
+        for a in range(5) for b in range(4) for c in range(3)
+    ]  # fmt: skip
+    stack = np.stack(waves, axis=1).astype(np.float32)
+    mix = rng.normal(size=(stack.shape[1], count)).astype(np.float32)
+    return 0.5 * (stack @ mix)
+
+
 class Transport:
     """The compressed operator of a scene: `shade` turns a table into a part's pixels.
 
@@ -143,8 +230,8 @@ class Transport:
     scene : Scene
     grid : HalfDiffGrid
         The grid of the tables to be shown.
-    training : (grid.size, T) float32
-        Scalar tables (single colour channels) whose images the basis is fitted to.
+    training : Training
+        What the basis is fitted to: see `training_tables`.
     rank : int
         Basis images for each part and colour.
     resolution : float
@@ -155,23 +242,27 @@ class Transport:
     progress : called with (stage, fraction)
     """
 
-    SUBSET_FACTOR = 5
+    TRAINING_ROWS = 320
+    """Pixels of a part (S) on which the training tables are compared."""
+    FIT_FACTOR = 6
+    """Rows of the least-squares fit for each basis image."""
     PROBES = 48
+    """Pixels of a part that are kept exact, to measure errors."""
 
     def __init__(
         self,
         scene: Scene,
         grid: HalfDiffGrid,
-        training: Float32,
-        rank: int = 48,
+        training: Training,
+        rank: int = 64,
         resolution: float = 1.0,
         seed: int = 0,
         device: str | torch.device = "cpu",
         progress: Progress | None = None,
     ) -> None:
-        if training.ndim != 2 or training.shape[0] != grid.size:
+        if training.tables.ndim != 2 or training.tables.shape[0] != grid.size:
             raise ValueError(
-                f"training: expected shape ({grid.size}, tables), got {training.shape}"
+                f"training: expected shape ({grid.size}, tables), got {training.tables.shape}"
             )
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
@@ -183,87 +274,106 @@ class Transport:
         report = progress or (lambda stage, fraction: None)
         rng = np.random.default_rng(seed)
         self._backdrop = torch.from_numpy(scene.backdrop()).reshape(-1, 3).to(self.device)
-        picks = [self._pick(part, rng) for part in range(len(scene.parts))]
-        # cells that no pixel of the subset or the probes sees are neither decoded nor stored
-        seen = np.zeros(grid.size, bool)
-        samples: list[tuple[Float32, Float32]] = []
-        for part, (subset, probes) in enumerate(picks):
-            report("sampling", part / len(picks))
-            rows = self.operator.rows(subset)
-            exact = self.operator.rows(probes, 2.0 * resolution)
-            seen |= (rows != 0.0).any(axis=(0, 1)) | (exact != 0.0).any(axis=(0, 1))
-            samples.append((rows, exact))
-        self.cells = np.flatnonzero(seen)
-        """(n,) flat indices of the table cells that the scene can see."""
-        tables = torch.from_numpy(np.ascontiguousarray(training))
-        self.parts: list[_PartBasis | None] = []
+        tables = torch.from_numpy(np.ascontiguousarray(training.tables))
+        importance = torch.from_numpy(training.weight)
+        drafts: list[_Draft | None] = []
         done, total = 0, max(len(scene.pixels), 1)
-        for part, (subset, probes) in enumerate(picks):
-            pixels = np.arange(len(scene.pixels))[scene.part_slice(part)]
+        for part in range(len(scene.parts)):
+            where = scene.part_slice(part)
+            pixels = np.arange(where.start, where.stop)
             if len(pixels) == 0:
-                self.parts.append(None)
+                drafts.append(None)
                 continue
-            rows, exact = samples[part]
-            samples[part] = (rows[:0], exact[:0])
-            wanted = self._combinations(torch.from_numpy(rows), tables)
+            shuffled = rng.permutation(pixels)
+            probes = np.sort(shuffled[: min(self.PROBES, len(pixels) // 4)])
+            subset = np.sort(shuffled[len(probes) :][: self.TRAINING_ROWS])
+            if len(probes) == 0:  # a handful of pixels: nothing can be kept apart
+                probes = subset
+            mix = self._combinations(torch.from_numpy(self.operator.rows(subset)), tables, importance)
             images = []
             for chunk in _chunks(pixels):
-                images.append(self.operator.images(chunk, wanted))
+                images.append(self.operator.images(chunk, mix))
                 done += len(chunk)
-                report("basis", done / total)
+                report("basis images", done / total)
             basis = torch.linalg.qr(torch.cat(images, dim=1)).Q
-            self.parts.append(self._compress(basis, pixels, subset, probes, rows, exact))
+            fit, weight = self._fit_pixels(basis, pixels, probes, rng)
+            rows = self.operator.rows(fit)
+            exact = self.operator.rows(probes, 2.0 * resolution)
+            drafts.append(_Draft(pixels, basis, fit, weight, rows, probes, exact))
+        # cells that none of these pixels sees are neither decoded nor stored
+        seen = np.zeros(grid.size, bool)
+        for draft in drafts:
+            if draft is not None:
+                seen |= (draft.rows != 0.0).any(axis=(0, 1))
+                seen |= (draft.exact != 0.0).any(axis=(0, 1))
+        self.cells = np.flatnonzero(seen)
+        """(n,) flat indices of the table cells that the scene can see."""
+        self.parts: list[_PartBasis | None] = []
+        for i, draft in enumerate(drafts):
+            self.parts.append(None if draft is None else self._compress(draft))
+            drafts[i] = None
+            report("least squares", (i + 1) / len(drafts))
 
-    def _pick(
-        self, part: int, rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Disjoint pixels of a part: the subset S, and the probes."""
-        where = self.scene.part_slice(part)
-        pixels = rng.permutation(np.arange(where.start, where.stop))
-        probes = min(self.PROBES, len(pixels) // 4)
-        subset = pixels[probes : probes + self.SUBSET_FACTOR * self.rank]
-        return np.sort(subset), np.sort(pixels[:probes]) if probes else np.sort(subset)
+    def _fit_pixels(
+        self,
+        basis: torch.Tensor,
+        pixels: NDArray[np.int64],
+        probes: NDArray[np.int64],
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.int64], Float64]:
+        """Pixels and weights of the least-squares fit: a third by leverage, the rest by chance."""
+        candidates = np.setdiff1d(pixels, probes) if len(pixels) > len(probes) else pixels
+        count = min(self.FIT_FACTOR * basis.shape[-1], len(candidates))
+        leverage = (basis.double() ** 2).sum(dim=(0, 2)).numpy()[candidates - pixels[0]]
+        order = np.argsort(-leverage, kind="stable")
+        leading, others = order[: count // 3], order[count // 3 :]
+        drawn = rng.choice(others, count - len(leading), replace=False)
+        chosen = np.concatenate([leading, drawn])
+        # each drawn pixel speaks for its share of the pixels that were not taken for leverage
+        share = math.sqrt(len(others) / max(len(drawn), 1))
+        weight = np.concatenate([np.ones(len(leading)), np.full(len(drawn), share)])
+        ascending = np.argsort(chosen)
+        return candidates[chosen[ascending]], weight[ascending]
 
-    def _combinations(self, rows: torch.Tensor, tables: torch.Tensor) -> torch.Tensor:
+    def _combinations(
+        self, rows: torch.Tensor, tables: torch.Tensor, importance: torch.Tensor
+    ) -> torch.Tensor:
         """M = X Y Sigma^-1 (3, cells, r) for the rows (m, 3, cells) of the subset."""
         combinations = []
         for c in range(3):
             images = (rows[:, c] @ tables).double()
             scale = images.mean(dim=0)
             lit = scale > 0.0
-            weight = torch.where(lit, 1.0 / torch.where(lit, scale, 1.0), 0.0)
+            weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
             images = images * weight
-            _, sigma, yt = torch.linalg.svd(images, full_matrices=False)
-            rank = min(self.rank, len(sigma))
-            keep = sigma[:rank] > 1e-7 * sigma[0].clamp_min(1e-30)
-            inverse = torch.where(keep, 1.0 / torch.where(keep, sigma[:rank], 1.0), 0.0)
-            mix = weight[:, None] * yt[:rank].T * inverse
+            # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
+            squares, u = torch.linalg.eigh(images @ images.T)
+            rank = min(self.rank, len(squares))
+            squares, u = squares.flip(0)[:rank], u.flip(1)[:, :rank]
+            keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
+            inverse = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
+            mix = weight[:, None] * (images.T @ u) * inverse
             combinations.append((tables.double() @ mix).float())
         return torch.stack(combinations)
 
-    def _compress(
-        self,
-        basis: torch.Tensor,
-        pixels: NDArray[np.int64],
-        subset: NDArray[np.int64],
-        probes: NDArray[np.int64],
-        rows: Float32,
-        exact: Float32,
-    ) -> _PartBasis:
-        first = int(pixels[0])
+    def _compress(self, draft: _Draft) -> _PartBasis:
+        pixels, basis, scene = draft.pixels, draft.basis, self.scene
         seen = torch.from_numpy(self.cells)
-        sampled = basis[:, torch.from_numpy(subset - first)].double()
-        rows_seen = torch.from_numpy(rows)[:, :, seen].permute(1, 0, 2)
-        projection = (torch.linalg.pinv(sampled, rtol=1e-6) @ rows_seen.double()).float()
-        scene = self.scene
+        weight = torch.from_numpy(draft.weight)[:, None]
+        sampled = basis[:, torch.from_numpy(draft.fit - pixels[0])].double() * weight
+        gram = sampled.transpose(1, 2) @ sampled
+        solve = (torch.linalg.solve(gram, sampled.transpose(1, 2)) * weight.T).float()
+        rows = torch.from_numpy(draft.rows)[:, :, seen].permute(1, 0, 2)
         mirror = scene.environment.radiance(reflect(scene.views[pixels], scene.normals[pixels]))
         move = self.device
         return _PartBasis(
             pixels=torch.from_numpy(scene.pixels[pixels]).to(move),
             basis=basis.contiguous().to(move),
-            projection=projection.contiguous().to(move),
-            probe_rows=torch.from_numpy(exact)[:, :, seen].permute(1, 0, 2).contiguous().to(move),
-            probe_basis=basis[:, torch.from_numpy(probes - first)].contiguous().to(move),
+            projection=torch.bmm(solve, rows).to(move),
+            probe_rows=(
+                torch.from_numpy(draft.exact)[:, :, seen].permute(1, 0, 2).contiguous().to(move)
+            ),
+            probe_basis=basis[:, torch.from_numpy(draft.probes - pixels[0])].contiguous().to(move),
             mirror=torch.from_numpy(np.ascontiguousarray(mirror)).to(move),
         )
 
