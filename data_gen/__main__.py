@@ -7,8 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from data_gen.packing import COMPONENTS, COUNT, SEED, build, pack
-from traitbrdf.embedding import read_artifact
+from data_gen.packing import COMPONENTS, COUNT, SEED, build
+from traitbrdf.formats import write_arrays
 
 _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "library.npz"
 
@@ -32,14 +32,13 @@ def main(arguments: list[str] | None = None) -> int:
 
     try:
         arrays = build(given.count, given.seed, given.components, progress)
-        pack(given.out, arrays)
+        write_arrays(given.out, arrays)
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
         return 1
     except ValueError as error:
         print(f"data_gen: {error}", file=sys.stderr)
         return 1
-    read_artifact(given.out)
     print(
         f"{given.out}: {len(arrays['names'])} materials, {3 * given.components} coordinates, "
         f"{given.out.stat().st_size / 1e6:.2f} MB, {time.perf_counter() - start:.1f} s"

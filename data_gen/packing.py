@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from data_gen.families import materials
 from data_gen.labels import descriptors, labels, trait_values
 from traitbrdf.brdf import TabulatedBRDF
 from traitbrdf.embedding import GRID, BRDFEmbedding
-from traitbrdf.formats import atomic_path
 from traitbrdf.traits import TraitSpace
 
 COUNT = 400
@@ -53,7 +51,9 @@ def build(
     embedding.high_ = coordinates.max(axis=0).astype(np.float64)
     report("embedding", 1.0)
     marks = {name: labels(values) for name, values in trait_values(rows).items()}
-    space = TraitSpace.fit(coordinates, marks, embedding.low_, embedding.high_)
+    space = TraitSpace.fit(
+        coordinates, marks, embedding.low_, embedding.high_, families
+    )
     report("traits", 1.0)
     return {
         **embedding.arrays(),
@@ -64,8 +64,3 @@ def build(
         "labels": np.stack([marks[name] for name in space.names]),
     }
 
-
-def pack(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write the artifact; an interrupted run leaves the old file."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

@@ -349,9 +349,9 @@ def hemisphere_nodes(
 ) -> tuple[Float64, Float64, Float64, Float64]:
     """Quadrature of the light hemisphere around the mirror direction of one view.
 
-    Gauss-Legendre between consecutive `theta_h` nodes (where tables are smooth) and, on every
-    ring, over exactly the half of azimuths for which wi is above the horizon (the other half is
-    its mirror image), with d omega_i = 4 cos(theta_d) d omega_h.
+    Gauss-Legendre between consecutive `theta_h` nodes, ascending (tables are smooth between
+    them), and, on every ring, over exactly the half of azimuths for which wi is above the horizon
+    (the other half is its mirror image), with d omega_i = 4 cos(theta_d) d omega_h.
 
     Returns
     -------
@@ -359,7 +359,10 @@ def hemisphere_nodes(
         ``sum(weight * f)`` is the integral of f cos(theta_i) d omega_i.
     """
     x, wx = np.polynomial.legendre.leggauss(per_interval)
-    low, high = theta_h[:-1], theta_h[1:]
+    # between these two the horizon cuts the rings: the integrand has a kink at either
+    kinks = np.array([0.25 * math.pi - 0.5 * theta_o, 0.25 * math.pi + 0.5 * theta_o])
+    breaks = np.unique(np.concatenate([theta_h, np.clip(kinks, theta_h[0], theta_h[-1])]))
+    low, high = breaks[:-1], breaks[1:]
     th = (low + (high - low) * 0.5 * (x[:, None] + 1.0)).T.ravel()
     wh = ((high - low) * 0.5 * wx[:, None]).T.ravel()
     so, co = math.sin(theta_o), math.cos(theta_o)

@@ -14,8 +14,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from importlib import resources
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.decomposition import PCA
 
 from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, Reflectance, TabulatedBRDF, albedo_operator
-from traitbrdf.formats import FormatError
+from traitbrdf.formats import artifact, unknown_name
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -333,36 +331,6 @@ class Library:
         if name not in self._index:
             raise ValueError(unknown_name("material", name, self.names))
         return self._index[name]
-
-
-def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
-    """The message for a name that is not there, naming the near ones."""
-    import difflib
-
-    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "there is nothing like it"
-    some = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-    return f"unknown {kind} {name!r}: {hint} Known: {some}"
-
-
-@functools.lru_cache(maxsize=1)
-def artifact() -> dict[str, NDArray[Any]]:
-    """The arrays that ``python -m data_gen`` packed and the package ships."""
-    return read_artifact(resources.files("traitbrdf").joinpath("data", "library.npz"))
-
-
-def read_artifact(path: Any) -> dict[str, NDArray[Any]]:
-    """Arrays of an artifact file; nothing in it is ever executed.
-
-    Raises
-    ------
-    traitbrdf.formats.FormatError
-    """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except (ValueError, OSError, EOFError, KeyError) as error:
-        raise FormatError(path, "the arrays packed by `python -m data_gen`", str(error)) from error
 
 
 @functools.lru_cache(maxsize=1)

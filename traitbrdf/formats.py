@@ -12,13 +12,18 @@ also negative or non-finite numbers: whoever takes them as light has to check th
 from __future__ import annotations
 
 import contextlib
+import difflib
+import functools
 import io
 import math
 import os
 import secrets
 import struct
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -425,6 +430,37 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
     return np.asarray(255.0 * encoded + 0.5).astype(np.uint8)
 
 
+def exposure_of(linear: ArrayLike) -> float:
+    """The exposure at which an image (H, W, 3) looks right: its 90th percentile becomes bright."""
+    bright = float(np.quantile(np.asarray(linear, np.float64).max(axis=-1), 0.9))
+    return 0.8 / bright if bright > 0.0 else 1.0
+
+
+def tone_map(linear: ArrayLike, exposure: float = 1.0) -> NDArray[np.uint8]:
+    """A picture (..., 3) uint8 of linear radiance (..., 3): filmic shoulder, then sRGB.
+
+    The curve is Narkowicz's fit (2015) of the ACES reference rendering; `exposure` scales the
+    radiance first.
+
+    Raises
+    ------
+    ValueError
+        On another last axis, NaN, or an exposure that is not positive and finite.
+    """
+    if not (math.isfinite(exposure) and exposure > 0.0):
+        raise ValueError(f"exposure: expected a positive number, got {exposure!r}")
+    x = np.clip(np.asarray(linear, np.float64) * exposure, 0.0, 1e6)
+    return encode_srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14))
+
+
+def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
+    """The message for a name that does not exist: the near ones, and some that do."""
+    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
+    some = ", ".join(known[:12]) + (f", ... ({len(known)} in all)" if len(known) > 12 else "")
+    return f"unknown {kind} {name!r}: {hint}Known: {some}"
+
+
 # ---------------------------------------------------------------------------------------------
 # MERL materials
 
@@ -638,3 +674,44 @@ def _check_rgl(path: PathName, fields: RGLFields) -> None:
             path, "positive sigma and ndf",
             f"minima of {fields.sigma.min()} and {fields.ndf.min()}",
         )
+
+
+# ---------------------------------------------------------------------------------------------
+# The artifact of data_gen
+
+
+@functools.lru_cache(maxsize=1)
+def artifact() -> dict[str, NDArray[Any]]:
+    """The arrays that ``python -m data_gen`` packed and the package ships."""
+    return read_arrays(resources.files("traitbrdf").joinpath("data", "library.npz"))
+
+
+def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
+    """The named arrays of an ``.npz`` file; nothing in the file is ever executed.
+
+    Parameters
+    ----------
+    path : a path, or anything with ``open("rb")``
+
+    Raises
+    ------
+    FileNotFoundError, FormatError
+    """
+    source = Path(path) if isinstance(path, (str, PathLike)) else path
+    try:
+        with source.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except FileNotFoundError:
+        raise
+    except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile,
+            zlib.error) as error:  # fmt: skip
+        raise FormatError(str(path), "a file of named arrays (.npz)", str(error)) from error
+
+
+def write_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays, compressed; atomic. Object arrays are refused (TypeError)."""
+    for name, value in arrays.items():
+        if value.dtype == object:
+            raise TypeError(f"{name}: expected plain numbers or text, got objects")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.directions import half_diff_angles, reflect, to_local
@@ -116,6 +116,25 @@ def render(
         )
         flat[scene.pixels[inside]] = values[:, 0]
     return image
+
+
+def relative_error(image: ArrayLike, reference: ArrayLike) -> float:
+    """Mean relative L1: mean|I - I_ref| / mean(I_ref), linear radiance of the same shape."""
+    shown, true = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if shown.shape != true.shape:
+        raise ValueError(f"image: expected the reference's shape {true.shape}, got {shown.shape}")
+    level = true.mean()
+    deviation = np.abs(shown - true).mean()
+    return float(deviation / level) if level > 0.0 else float(deviation)
+
+
+def tone_mapped_psnr(image: ArrayLike, reference: ArrayLike) -> float:
+    """PSNR in dB of the tone-mapped pictures (..., 3), exposed for the reference; at most 99."""
+    exposure = exposure_of(reference)
+    shown = tone_map(image, exposure).astype(np.float64)
+    true = tone_map(reference, exposure).astype(np.float64)
+    squared = float(np.mean((shown - true) ** 2))
+    return min(99.0, 10.0 * math.log10(255.0**2 / squared)) if squared > 0.0 else 99.0
 
 
 class _Evaluator:

@@ -6,11 +6,12 @@ linear support vector machine between members of the library that have it and me
 percentile of the library has 0 and the 90th has 1.
 
 A move changes scores by given amounts, holds others, and takes among all ways to do so the one
-that is shortest measured by the library's covariance: the one most like what real materials do.
+that is shortest measured by a covariance of the library: the one most like what real materials do.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -19,10 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.svm import SVC
 
+from traitbrdf.formats import artifact, unknown_name
+
 Float64 = NDArray[np.float64]
 
 GROUPS = {"colour": ("red", "green", "blue"), "color": ("red", "green", "blue")}
 """Names that stand for several traits where traits are held."""
+
+_BETWEEN = 0.05  # what differences between families count in the metric of moves
 
 _RIDGE = 1e-3  # of the mean variance: keeps the metric regular where the library is flat
 
@@ -37,7 +42,8 @@ class TraitSpace:
         Gradient of each raw score.
     typical : (t, 2) array
         Raw scores of the library's 10th and 90th percentile.
-    covariance : (k, k) array, of the library's coordinates
+    covariance : (k, k) array
+        How coordinates vary together: the metric in which moves are short.
     low, high : (k,) arrays, the gamut box
     """
 
@@ -76,6 +82,7 @@ class TraitSpace:
         labels: Mapping[str, ArrayLike],
         low: ArrayLike,
         high: ArrayLike,
+        families: Sequence[str] | None = None,
     ) -> TraitSpace:
         """Trait vectors from labelled members.
 
@@ -84,6 +91,9 @@ class TraitSpace:
         coordinates : (n, k) array_like
         labels : for each trait (n,) values: 1 has it, -1 has it not, 0 unclear
         low, high : (k,) gamut box
+        families : (n,) names or None
+            Kinds of material. Moves then follow how members differ from others of their kind,
+            and only a little how kinds differ: a shinier plastic is a plastic still, and no metal.
 
         Raises
         ------
@@ -107,7 +117,16 @@ class TraitSpace:
             normal = machine.coef_[0] / scale
             normals.append(normal)
             typical.append(np.percentile(z @ normal, [10.0, 90.0]))
-        return cls(list(labels), normals, typical, np.cov(z.T), low, high)
+        covariance = np.cov(z.T)
+        if families is not None:
+            kinds = np.asarray(families)
+            if kinds.shape != (len(z),):
+                raise ValueError(f"families: expected ({len(z)},) names, got {kinds.shape}")
+            centred = z.copy()
+            for kind in np.unique(kinds):
+                centred[kinds == kind] -= z[kinds == kind].mean(axis=0)
+            covariance = np.cov(centred.T) + _BETWEEN * covariance
+        return cls(list(labels), normals, typical, covariance, low, high)
 
     def __repr__(self) -> str:
         return f"TraitSpace({', '.join(self.names)})"
@@ -115,11 +134,7 @@ class TraitSpace:
     def index(self, name: str) -> int:
         """Where a trait stands in `names`; an unknown one raises ValueError naming near ones."""
         if name not in self.names:
-            import difflib
-
-            near = difflib.get_close_matches(str(name), self.names, n=3, cutoff=0.4)
-            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else ""
-            raise ValueError(f"unknown trait {name!r}: {hint} Known: {', '.join(self.names)}")
+            raise ValueError(unknown_name("trait", name, self.names))
         return self.names.index(name)
 
     def score(self, z: ArrayLike) -> dict[str, float]:
@@ -245,3 +260,9 @@ def _amount(name: str, value: float) -> float:
     return amount
 
 
+
+
+@functools.lru_cache(maxsize=1)
+def default_traits() -> TraitSpace:
+    """The traits that the package ships, for `traitbrdf.default_embedding`."""
+    return TraitSpace.from_arrays(artifact())
