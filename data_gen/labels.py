@@ -98,4 +98,4 @@ def trait_values(rows: Sequence[Mapping[str, float]]) -> dict[str, Float64]:
 def labels(values: Float64) -> NDArray[np.int8]:
     """1 (yes) in the upper third, -1 (no) in the lower third, 0 (unclear) between."""
     low, high = np.quantile(values, [SHARE, 1.0 - SHARE])
-    return (np.int8(1) * (values >= high) - np.int8(1) * (values <= low)).astype(np.int8)
+    return np.asarray((values >= high).astype(np.int8) - (values <= low).astype(np.int8))

@@ -52,7 +52,7 @@ def build(
     report("embedding", 1.0)
     marks = {name: labels(values) for name, values in trait_values(rows).items()}
     space = TraitSpace.fit(
-        coordinates, marks, embedding.low_, embedding.high_, families
+        coordinates, marks, embedding.low_, embedding.high_, families, embedding.body_rows()
     )
     report("traits", 1.0)
     return {

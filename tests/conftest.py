@@ -1,4 +1,4 @@
-"""What several test files share: the folder of real data, and a writer of tensor files."""
+"""What several test files share: real data, a writer of tensor files, small scenes to shade."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from traitbrdf.embedding import default_embedding, default_library
+from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene import Camera, Scene
+from traitbrdf.shapes import sphere, teapot
+from traitbrdf.transport import Training, training_tables
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8")
 
@@ -85,3 +91,29 @@ def rgl_fields() -> dict[str, Any]:
         "jacobian": np.zeros(1, np.uint8),
         "version": np.array([1, 0], np.uint32),
     }
+
+
+@pytest.fixture(scope="session")
+def small_sphere() -> Scene:
+    """A sphere under a coarse sky: some 1,800 pixels."""
+    return Scene(sphere(), EnvironmentMap.sky(rows=32), camera=Camera.orbit(20.0, 10.0), size=48)
+
+
+@pytest.fixture(scope="session")
+def small_teapot() -> Scene:
+    """A teapot under a coarse, turned sky and two lights beside it, in an oblong frame."""
+    lights = [
+        PointLight(position=(3.0, 4.0, 3.0), intensity=(20.0, 18.0, 15.0)),
+        DirectionalLight(direction=(-1.0, 2.0, 0.7), irradiance=(0.3, 0.4, 0.6)),
+    ]
+    sky = EnvironmentMap.sky(rows=32).rotated(0.7)
+    return Scene(teapot(), sky, lights, Camera.orbit(35.0, 20.0), size=(48, 60))
+
+
+@pytest.fixture(scope="session")
+def training() -> Training:
+    """Every sixth of the tables that a session trains its bases with."""
+    embedding, library = default_embedding(), default_library()
+    channels = [embedding.decode_values(z) for z in library.coordinates[::6]]
+    whole = training_tables(np.concatenate(channels, axis=1), embedding.grid_)
+    return Training(np.ascontiguousarray(whole.tables[:, ::3]), whole.weight[::3])

@@ -74,6 +74,8 @@ class BRDFEmbedding:
         grid = tables[0].grid
         if any(t.grid != grid for t in tables):
             raise ValueError("tables: expected all on one grid, got several")
+        if grid.layout != "folded":
+            raise ValueError(f"tables: expected the 'folded' layout, got {grid.layout!r}")
         if 3 * len(tables) <= self.n_components:
             raise ValueError(
                 f"n_components: expected fewer than the {3 * len(tables)} channels of the "
@@ -92,7 +94,11 @@ class BRDFEmbedding:
         )
         scores = pca.fit_transform(logs * self.weight_)
         deviation = np.sqrt(pca.explained_variance_)
-        deviation = np.where(deviation > 0.0, deviation, 1.0)
+        if deviation.min() <= 1e-5 * max(1.0, float(deviation.max())):
+            raise ValueError(
+                f"tables: expected at least {self.n_components + 1} different channels, "
+                f"got tables that span {int(np.sum(deviation > 1e-5))} dimensions"
+            )
         scores = scores / deviation
         self.explained_variance_ratio_ = np.asarray(pca.explained_variance_ratio_, np.float64)
         # loadings by regression on the scores, so that cells below the horizon have them too
@@ -141,8 +147,16 @@ class BRDFEmbedding:
         return value
 
     def encode(self, brdf: Reflectance) -> Float64:
-        """Coordinates (k,) of a table on any grid, or of a model; not clipped to the gamut."""
+        """Coordinates (k,) of a table on any grid, or of a model; not clipped to the gamut.
+
+        Raises
+        ------
+        TypeError
+            On something that has no ``eval``.
+        """
         self._fitted()
+        if not callable(getattr(brdf, "eval", None)):
+            raise TypeError(f"brdf: expected a table or a model with an eval method, got {brdf!r}")
         if isinstance(brdf, TabulatedBRDF):
             table = brdf.regrid(self.grid_)
         else:
@@ -208,9 +222,11 @@ class BRDFEmbedding:
         log(f + FLOOR): what a given table has beyond the manifold.
         """
         scores = (_OPPONENT.T @ self.clip(z).reshape(3, -1)).T.astype(np.float32)
-        logs = self.components_ @ scores
+        logs: Float32 = self.components_ @ scores
         logs += self.mean_[:, None]
         if offset is not None:
+            if offset.shape != logs.shape:
+                raise ValueError(f"offset: expected shape {logs.shape}, got {offset.shape}")
             logs += offset
         # no BRDF reaches 1e13: keep exp from overflowing for offsets from outside
         np.exp(np.minimum(logs, 30.0, out=logs), out=logs)
@@ -226,10 +242,24 @@ class BRDFEmbedding:
 
         ``decode_values(encode(brdf), residual(brdf))`` is the table itself.
         """
+        self._fitted()
         table = brdf.regrid(self.grid_)
         z = self.clip(self.encode(table)).reshape(3, -1)
         decoded = self.mean_[:, None] + self.components_ @ (_OPPONENT.T @ z).T.astype(np.float32)
-        return (_log_map(table.values).reshape(-1, 3) - decoded).astype(np.float32)
+        return np.asarray(_log_map(table.values).reshape(-1, 3) - decoded, np.float32)
+
+    def body_rows(self) -> Float64:
+        """(3, k) rows that give, to a constant, the mean log f of the body on the colour axes.
+
+        The body is what is seen between 35 and 50 degrees from the mirror direction's half
+        vector, far from grazing; log f is linear in the coordinates, so this is exact.
+        """
+        self._fitted()
+        th, td, _ = self.grid_.node_angles()
+        h, d = np.degrees(th), np.degrees(td)
+        body = ((h > 35.0) & (h < 50.0) & (d > 2.0) & (d < 25.0)).ravel()
+        row = self.components_[body].mean(axis=0).astype(np.float64)
+        return np.kron(np.eye(3), row)
 
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
         """The table at coordinates `z` (k,), on the embedding's grid or any other."""
@@ -254,7 +284,8 @@ class BRDFEmbedding:
         """The inverse of `arrays`."""
         components = state["components"].astype(np.float32)
         result = cls(int(components.shape[1]))
-        result.grid_ = HalfDiffGrid(*(int(n) for n in state["grid"]), "folded")
+        n_h, n_d, n_p = (int(n) for n in state["grid"])
+        result.grid_ = HalfDiffGrid(n_h, n_d, n_p, "folded")
         result.weight_ = _cell_weight(result.grid_)
         result.mean_ = state["mean"].astype(np.float32)
         result.components_ = np.ascontiguousarray(components)
@@ -266,13 +297,14 @@ class BRDFEmbedding:
 
 
 def _log_map(values: NDArray[Any]) -> Float32:
-    return np.log(np.asarray(values, np.float32) + np.float32(FLOOR))
+    logs: Float32 = np.log(np.asarray(values, np.float32) + np.float32(FLOOR))
+    return logs
 
 
 def _cell_weight(grid: HalfDiffGrid) -> Float32:
     th, td, pd = grid.node_angles()
     lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
-    return np.sqrt(np.maximum(lower, 0.0)).ravel().astype(np.float32)
+    return np.asarray(np.sqrt(np.maximum(lower, 0.0)).ravel(), np.float32)
 
 
 class Library:

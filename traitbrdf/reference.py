@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.directions import half_diff_angles, reflect, to_local
+from traitbrdf.formats import exposure_of, tone_map
 from traitbrdf.lights import EnvironmentMap, Light, PointLight
 from traitbrdf.scene import Scene
 

@@ -11,9 +11,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+
+_FURTHEST = 1e9  # pixels: beyond, squares of distances would lose the brush
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,8 @@ class Stroke:
             raise TypeError(f"points: expected (x, y) pairs, got {self.points!r}") from None
         if line.ndim != 2 or line.shape[1] != 2 or len(line) == 0:
             raise ValueError(f"points: expected at least one (x, y), got shape {line.shape}")
-        if not np.isfinite(line).all():
-            raise ValueError("points: expected finite coordinates")
+        if not np.all(np.abs(line) <= _FURTHEST):
+            raise ValueError(f"points: expected finite coordinates of at most {_FURTHEST:g} pixels")
         if not isinstance(self.trait, str):
             raise TypeError(f"trait: expected a name, got {self.trait!r}")
         for name in ("amount", "radius"):
@@ -60,12 +65,18 @@ class Stroke:
                 raise TypeError(f"{name}: expected a number, got {value!r}")
             if not math.isfinite(value):
                 raise ValueError(f"{name}: expected a finite number, got {value!r}")
-        if self.radius <= 0.0:
-            raise ValueError(f"radius: expected a positive number of pixels, got {self.radius!r}")
+        if not 0.0 < self.radius <= _FURTHEST:
+            raise ValueError(
+                f"radius: expected a positive number of pixels up to {_FURTHEST:g}, "
+                f"got {self.radius!r}"
+            )
         points = tuple((float(x), float(y)) for x, y in line)
         object.__setattr__(self, "points", points)
         if self.hold is not None:
-            hold = (self.hold,) if isinstance(self.hold, str) else tuple(self.hold)
+            try:
+                hold = (self.hold,) if isinstance(self.hold, str) else tuple(self.hold)
+            except TypeError:
+                raise TypeError(f"hold: expected names of traits, got {self.hold!r}") from None
             object.__setattr__(self, "hold", hold)
 
     def coverage(self, height: int, width: int) -> Float32:
@@ -93,7 +104,9 @@ class Stroke:
             t = np.clip(t, 0.0, 1.0)
             away = (x - ax - t * dx) ** 2 + (y - ay - t * dy) ** 2
             np.minimum(squared, away, out=squared)
-        fade = np.clip(2.0 - 2.0 * np.sqrt(squared) / reach, 0.0, 1.0)
+        # beyond the rim all is the same: do not divide by a tiny radius there
+        away = np.minimum(np.sqrt(squared), reach)
+        fade = np.clip(2.0 - 2.0 * away / reach, 0.0, 1.0)
         result[y0:y1, x0:x1] = fade * fade * (3.0 - 2.0 * fade)
         return result
 
@@ -117,3 +130,78 @@ def region_weights(
     totals = np.bincount(region[on], weights=coverage[on], minlength=count)[:count]
     whole = totals.sum()
     return np.asarray(totals / whole if whole > 0.0 else totals, np.float64)
+
+
+def follow(inside: NDArray[np.bool_]) -> tuple[list[tuple[float, float]], float]:
+    """A stroke that runs along a region and stays within it.
+
+    The longest of the shortest paths through the region's largest piece, drawn towards its
+    middle line, and the greatest brush radius that touches nothing outside.
+
+    Parameters
+    ----------
+    inside : (H, W) mask with at least one pixel
+
+    Returns
+    -------
+    points : list of (x, y)
+    radius : pixels
+    """
+    if not inside.any():
+        raise ValueError("inside: expected a region of at least one pixel, got none")
+    # a border of zeros: the rim of the image bounds the region as well
+    depth = scipy.ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
+    pieces, _ = scipy.ndimage.label(depth >= 0.4 * depth.max())
+    largest = int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1
+    row, column = np.nonzero(pieces == largest)
+    node = np.full(inside.shape, -1)
+    node[row, column] = np.arange(len(row))
+    links = []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        y, x = row + dy, column + dx
+        fits = (y < inside.shape[0]) & (x >= 0) & (x < inside.shape[1])
+        to = np.full(len(row), -1)
+        to[fits] = node[y[fits], x[fits]]
+        ok = to >= 0
+        cost = math.hypot(dx, dy) / depth[row[ok], column[ok]] ** 2
+        links.append((np.flatnonzero(ok), to[ok], cost))
+    start, end, cost = (np.concatenate(part) for part in zip(*links, strict=True))
+    graph = scipy.sparse.csr_array((cost, (start, end)), shape=(len(row), len(row)))
+    deepest = int(np.argmax(depth[row, column]))
+    first = int(np.argmax(_reachable(graph, deepest)[0]))
+    distance, before = _reachable(graph, first)
+    path = [int(np.argmax(distance))]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    kept = path[:: max(1, len(path) // 24)]
+    if kept[-1] != path[-1]:
+        kept.append(path[-1])
+    points = [(float(column[i]) + 0.5, float(row[i]) + 0.5) for i in kept]
+    return points, _clear_radius(points, inside)
+
+
+def _reachable(
+    graph: scipy.sparse.csr_array, source: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    distance, before = scipy.sparse.csgraph.dijkstra(
+        graph, directed=False, indices=source, return_predecessors=True
+    )
+    return np.where(np.isfinite(distance), distance, -1.0), before
+
+
+def _clear_radius(points: list[tuple[float, float]], inside: NDArray[np.bool_]) -> float:
+    """The greatest radius at which a stroke covers no pixel outside; at least a third pixel."""
+    radius = float(max(inside.shape))
+    y, x = np.nonzero(~inside)
+    outside = np.stack([x + 0.5, y + 0.5], axis=1)
+    if len(outside):
+        line = np.asarray(points)
+        for a, b in zip(line, line[1:] if len(line) > 1 else line, strict=False):
+            along = b - a
+            length = float(along @ along)
+            t = np.clip((outside - a) @ along / length, 0.0, 1.0) if length > 0.0 else 0.0
+            away = outside - a - np.multiply.outer(t, along)
+            radius = min(radius, float(np.sqrt((away**2).sum(axis=1).min())))
+    else:
+        radius *= 0.25
+    return max(0.99 * radius, 1.0 / 3.0)

@@ -24,6 +24,9 @@ from traitbrdf.formats import artifact, unknown_name
 
 Float64 = NDArray[np.float64]
 
+KEEPS_BODY = ("shiny", "matte", "rough")
+"""Traits of the highlight: their moves keep the body below it as long as that is possible."""
+
 GROUPS = {"colour": ("red", "green", "blue"), "color": ("red", "green", "blue")}
 """Names that stand for several traits where traits are held."""
 
@@ -45,6 +48,9 @@ class TraitSpace:
     covariance : (k, k) array
         How coordinates vary together: the metric in which moves are short.
     low, high : (k,) arrays, the gamut box
+    body : (rows, k) array or None
+        Linear functions of the coordinates that say how the body below the highlight looks; what
+        "body" stands for where it is held, and what `KEEPS_BODY` traits keep while they can.
     """
 
     def __init__(
@@ -55,6 +61,7 @@ class TraitSpace:
         covariance: ArrayLike,
         low: ArrayLike,
         high: ArrayLike,
+        body: ArrayLike | None = None,
     ) -> None:
         self.names = tuple(names)
         self.normals = np.asarray(normals, np.float64)
@@ -70,6 +77,9 @@ class TraitSpace:
         span = self.typical[:, 1] - self.typical[:, 0]
         if not np.all(span > 0.0):
             raise ValueError("typical: expected the 90th percentile above the 10th for each trait")
+        self.body = np.zeros((0, k)) if body is None else np.asarray(body, np.float64)
+        if self.body.ndim != 2 or self.body.shape[1] != k or not np.isfinite(self.body).all():
+            raise ValueError(f"body: expected shape (rows, {k}), got {self.body.shape}")
         self._gradient = self.normals / span[:, None]
         self._offset = -self.typical[:, 0] / span
         ridge = _RIDGE * np.trace(self.covariance) / k
@@ -83,6 +93,7 @@ class TraitSpace:
         low: ArrayLike,
         high: ArrayLike,
         families: Sequence[str] | None = None,
+        body: ArrayLike | None = None,
     ) -> TraitSpace:
         """Trait vectors from labelled members.
 
@@ -94,6 +105,7 @@ class TraitSpace:
         families : (n,) names or None
             Kinds of material. Moves then follow how members differ from others of their kind,
             and only a little how kinds differ: a shinier plastic is a plastic still, and no metal.
+        body : (rows, k) or None, as for `TraitSpace`
 
         Raises
         ------
@@ -126,7 +138,7 @@ class TraitSpace:
             for kind in np.unique(kinds):
                 centred[kinds == kind] -= z[kinds == kind].mean(axis=0)
             covariance = np.cov(centred.T) + _BETWEEN * covariance
-        return cls(list(labels), normals, typical, covariance, low, high)
+        return cls(list(labels), normals, typical, covariance, low, high, body)
 
     def __repr__(self) -> str:
         return f"TraitSpace({', '.join(self.names)})"
@@ -151,7 +163,8 @@ class TraitSpace:
         ----------
         z : (k,) array_like
         amounts : for each trait to move by how much; 1 is from typically low to typically high
-        hold : traits whose scores shall stay, or the group "colour" (red, green and blue)
+        hold : traits whose scores shall stay; "colour" for red, green and blue together; "body"
+            for the look of what lies below the highlight
 
         Returns
         -------
@@ -166,6 +179,7 @@ class TraitSpace:
             held traits that forbid the move altogether.
         """
         start = self._point(z)
+        hold = (hold,) if isinstance(hold, str) else tuple(hold)
         moved = {self.index(name): _amount(name, value) for name, value in amounts.items()}
         held = self._held(hold)
         clash = [self.names[i] for i in moved if i in held]
@@ -173,27 +187,35 @@ class TraitSpace:
             raise ValueError(f"hold: {clash[0]!r} cannot be moved and held at once")
         if all(value == 0.0 for value in moved.values()):
             return start.copy()
-        rows = [*moved, *held]
-        a = self._gradient[rows]
-        wanted = np.array([*moved.values(), *(0.0 for _ in held)])
-        whole = _step(self._metric, a, wanted)
-        short = np.abs(a @ whole - wanted)
-        if short.max() > 1e-6 * max(1.0, np.abs(wanted).max()):
+        targets = np.array(list(moved.values()))
+        fixed = self._gradient[held]
+        if "body" in hold:
+            fixed = np.concatenate([fixed, self.body])
+        a = np.concatenate([self._gradient[list(moved)], fixed])
+        wanted = np.concatenate([targets, np.zeros(len(fixed))])
+        if not _possible(self._metric, a, wanted):
             raise ValueError(
-                f"cannot move {sorted(amounts)} while holding {sorted(self.names[i] for i in held)}:"
-                " these scores depend on each other; hold fewer traits"
+                f"cannot move {sorted(amounts)} while holding {sorted(hold)}: these scores depend "
+                "on each other; hold fewer traits"
             )
-        return self._walk(np.clip(start, self.low, self.high), a, wanted)
+        z, left = np.clip(start, self.low, self.high), 1.0
+        if "body" not in hold and any(self.names[i] in KEEPS_BODY for i in moved):
+            kept = np.concatenate([a, self.body])
+            z, left = self._walk(z, left, kept, np.append(wanted, np.zeros(len(self.body))))
+        return self._walk(z, left, a, wanted)[0]
 
-    def _walk(self, z: Float64, a: Float64, wanted: Float64) -> Float64:
-        """Go on along the shortest step of the coordinates that are not at a wall of the box."""
+    def _walk(
+        self, z: Float64, left: float, a: Float64, wanted: Float64
+    ) -> tuple[Float64, float]:
+        """Go the fraction `left` of a move, along the shortest step of the coordinates that are
+        not at a wall of the box; returns where that ends and the fraction left."""
         free = np.ones(len(z), bool)
-        left = 1.0
         while left > 1e-12 and free.any():
-            step = np.zeros_like(z)
-            step[free] = _step(self._metric[np.ix_(free, free)], a[:, free], wanted)
-            if np.abs(a @ step - wanted).max() > 1e-6 * np.abs(wanted).max():
+            metric, rows = self._metric[np.ix_(free, free)], a[:, free]
+            if not _possible(metric, rows, wanted):
                 break  # the free coordinates alone cannot do what is asked
+            step = np.zeros_like(z)
+            step[free] = _step(metric, rows, wanted)
             with np.errstate(divide="ignore", invalid="ignore"):
                 room = np.where(step > 0.0, (self.high - z) / step, (self.low - z) / step)
             room = np.where(step == 0.0, np.inf, np.maximum(room, 0.0))
@@ -201,13 +223,13 @@ class TraitSpace:
             z = np.clip(z + way * step, self.low, self.high)
             left -= way
             free &= room > way
-        return z
+        return z, left
 
-    def _held(self, hold: Iterable[str]) -> list[int]:
-        if isinstance(hold, str):
-            hold = (hold,)
+    def _held(self, hold: tuple[str, ...]) -> list[int]:
         held: list[int] = []
         for name in hold:
+            if name == "body":
+                continue
             for member in GROUPS.get(name, (name,)):
                 if self.index(member) not in held:
                     held.append(self.index(member))
@@ -228,6 +250,7 @@ class TraitSpace:
             "trait_normals": self.normals,
             "trait_typical": self.typical,
             "covariance": self.covariance,
+            "body": self.body,
         }
 
     @classmethod
@@ -240,6 +263,7 @@ class TraitSpace:
             state["covariance"],
             state["low"],
             state["high"],
+            state["body"],
         )
 
 
@@ -248,6 +272,12 @@ def _step(metric: Float64, a: Float64, wanted: Float64) -> Float64:
     spread = metric @ a.T
     solution, *_ = np.linalg.lstsq(a @ spread, wanted, rcond=1e-9)
     return np.asarray(spread @ solution)
+
+
+def _possible(metric: Float64, a: Float64, wanted: Float64) -> bool:
+    """Whether a step with a @ step = wanted exists."""
+    short = np.abs(a @ _step(metric, a, wanted) - wanted).max()
+    return bool(short <= 1e-6 * np.abs(wanted).max())
 
 
 def _amount(name: str, value: float) -> float:

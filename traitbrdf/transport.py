@@ -414,7 +414,9 @@ class Transport:
             pixels = pixels + mirror * known.mirror
         return PartFrame(pixels, deviation, level)
 
-    def shade_exactly(self, part: int, table: Float32, mirror: Float32 | None = None) -> PartFrame:
+    def shade_exactly(
+        self, part: int, table: Float32, mirror: torch.Tensor | None = None
+    ) -> PartFrame:
         """The same by the uncompressed operator: slow, for tables outside the basis.
 
         `table` is (grid.size, 3).
@@ -425,7 +427,7 @@ class Transport:
         radiance = self.operator.images(pixels, columns)[..., 0].T.to(self.device)
         known = self.parts[part]
         if known is not None and mirror is not None:
-            radiance = radiance + torch.from_numpy(mirror).to(self.device) * known.mirror
+            radiance = radiance + mirror * known.mirror
         return PartFrame(radiance, 0.0, float(radiance.mean()) if len(pixels) else 0.0)
 
     def compose(self, frames: list[PartFrame]) -> torch.Tensor:

@@ -1,0 +1,410 @@
+"""The embedding: round trips, physics of whatever is decoded, measurements with gaps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.embedding import (
+    FLOOR,
+    GRID,
+    BRDFEmbedding,
+    Library,
+    default_embedding,
+    default_library,
+)
+from traitbrdf.models import GGX, BoundedPhong, Lambert
+
+EMBEDDING = default_embedding()
+LIBRARY = default_library()
+CENTRE = 0.5 * (EMBEDDING.low_ + EMBEDDING.high_)
+SPAN = EMBEDDING.high_ - EMBEDDING.low_
+
+members = st.integers(0, len(LIBRARY) - 1)
+seeds = st.integers(0, 2**32 - 1)
+few = settings(deadline=None, max_examples=12)
+
+
+def log_difference(table, other):
+    """|log f - log f'| over the cells that the fit counts."""
+    logs = [np.log(np.asarray(v, np.float64).reshape(-1, 3) + FLOOR) for v in (table, other)]
+    return np.abs(logs[0] - logs[1])[EMBEDDING.weight_ > 0.0]
+
+
+def in_the_box(seed, spread=1.0):
+    return CENTRE + spread * np.random.default_rng(seed).uniform(-0.5, 0.5, EMBEDDING.size) * SPAN
+
+
+def on_the_manifold(z):
+    """The decoded table of z as it is before black cells and the albedo are clipped."""
+    clipped = EMBEDDING.clip(z)
+    table = EMBEDDING.decode_values(clipped)
+    logs = EMBEDDING.mean_[:, None] + EMBEDDING.components_ @ channels(clipped)
+    return table, np.allclose(table, np.exp(logs) - FLOOR, rtol=1e-3, atol=1e-6)
+
+
+def channels(z):
+    achromatic, red_blue, green = np.asarray(z).reshape(3, -1)
+    return np.stack(
+        [
+            achromatic / 3**0.5 + red_blue / 2**0.5 - green / 6**0.5,
+            achromatic / 3**0.5 + 2.0 * green / 6**0.5,
+            achromatic / 3**0.5 - red_blue / 2**0.5 - green / 6**0.5,
+        ],
+        axis=1,
+    ).astype(np.float32)
+
+
+def small_embedding(grid=None, components=2):
+    grid = grid or HalfDiffGrid(20, 8, 4)
+    models = [Lambert(0.2), Lambert((0.8, 0.5, 0.3)), GGX(0.3, 1.5, 0.0), BoundedPhong(0.6, 30.0)]
+    return BRDFEmbedding(components).fit([TabulatedBRDF.from_model(m, grid) for m in models])
+
+
+# -- round trips ------------------------------------------------------------------------------
+
+
+@few
+@given(members)
+def test_decoding_what_was_encoded_changes_little(i):
+    table = EMBEDDING.decode(LIBRARY.coordinates[i])
+    again = EMBEDDING.decode(EMBEDDING.encode(table))
+    assert np.median(log_difference(again.values, table.values)) < 0.02
+
+
+def test_members_on_the_manifold_come_back_exactly():
+    checked = 0
+    for z in LIBRARY.coordinates[::9]:
+        z = EMBEDDING.clip(z)
+        values, untouched = on_the_manifold(z)
+        if untouched:
+            table = TabulatedBRDF(GRID, values.reshape(*GRID.shape, 3))
+            np.testing.assert_allclose(EMBEDDING.encode(table), z, atol=2e-3)
+            checked += 1
+    assert checked >= 5
+
+
+def test_encode_is_what_the_library_holds():
+    """Also after the clipping of black and of the albedo a member is near its coordinates."""
+    away = []
+    for z in LIBRARY.coordinates[::20]:
+        again = EMBEDDING.encode(EMBEDDING.decode(z))
+        away.append(np.abs(again - EMBEDDING.clip(z)).max())
+    assert np.median(away) < 0.05
+
+
+@few
+@given(seeds)
+def test_a_table_is_its_encoding_and_its_residual(seed):
+    rng = np.random.default_rng(seed)
+    model = GGX(float(rng.uniform(0.02, 1.0)), 1.5, float(rng.uniform(0.0, 4.0)))
+    table = TabulatedBRDF.from_model(model, GRID)
+    assert table.max_albedo() <= 1.0
+    z, beyond = EMBEDDING.encode(table), EMBEDDING.residual(table)
+    np.testing.assert_allclose(
+        EMBEDDING.decode_values(z, beyond), table.values.reshape(-1, 3), rtol=2e-4, atol=1e-7
+    )
+
+
+def test_residual_of_a_table_outside_the_box():
+    brighter = TabulatedBRDF(GRID, np.full((*GRID.shape, 3), 0.999 / math.pi, np.float32))
+    z = EMBEDDING.encode(brighter)
+    values = EMBEDDING.decode_values(z, EMBEDDING.residual(brighter))
+    np.testing.assert_allclose(values, 0.999 / math.pi, rtol=2e-4)
+
+
+@few
+@given(members, st.permutations(range(3)))
+def test_colours_are_treated_alike(i, order):
+    """Permuting the channels of a table permutes the channels of its coordinates."""
+    table = LIBRARY[LIBRARY.names[i]]
+    swapped = TabulatedBRDF(GRID, table.values[..., order])
+    np.testing.assert_allclose(
+        channels(EMBEDDING.encode(swapped)), channels(EMBEDDING.encode(table))[:, order], atol=1e-4
+    )
+
+
+@few
+@given(members)
+def test_swapping_red_and_blue_negates_one_axis(i):
+    table = LIBRARY[LIBRARY.names[i]]
+    z = EMBEDDING.encode(table).reshape(3, -1)
+    swapped = EMBEDDING.encode(TabulatedBRDF(GRID, table.values[..., ::-1].copy())).reshape(3, -1)
+    np.testing.assert_allclose(swapped, z * [[1.0], [-1.0], [1.0]], atol=1e-5)
+
+
+def test_arrays_round_trip():
+    again = BRDFEmbedding.from_arrays(EMBEDDING.arrays())
+    assert again.grid_ == EMBEDDING.grid_
+    assert again.size == EMBEDDING.size
+    for name, value in EMBEDDING.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], value)
+    z = in_the_box(3)
+    np.testing.assert_array_equal(again.decode_values(z), EMBEDDING.decode_values(z))
+    table = LIBRARY["gold-polished"]
+    np.testing.assert_array_equal(again.encode(table), EMBEDDING.encode(table))
+
+
+def test_any_grid_and_models_encode_alike():
+    model = GGX(0.3, 1.5, 0.0)
+    direct = EMBEDDING.encode(model)
+    fine = TabulatedBRDF.from_model(model, HalfDiffGrid(90, 48, 17))
+    np.testing.assert_allclose(EMBEDDING.encode(fine), direct, atol=0.05)
+    coarse = EMBEDDING.decode(direct, HalfDiffGrid(40, 12, 5))
+    assert coarse.grid == HalfDiffGrid(40, 12, 5)
+    assert EMBEDDING.decode(direct).grid == GRID
+
+
+# -- physics ----------------------------------------------------------------------------------
+
+
+@few
+@given(seeds, st.sampled_from([1.0, 3.0, 30.0]))
+def test_whatever_is_decoded_is_a_passive_surface(seed, spread):
+    values = EMBEDDING.decode_values(in_the_box(seed, spread))
+    assert values.dtype == np.float32
+    assert np.isfinite(values).all()
+    assert values.min() >= 0.0
+    table = TabulatedBRDF(GRID, values.reshape(*GRID.shape, 3))
+    assert table.max_albedo() <= 1.0 + 1e-3
+
+
+@few
+@given(seeds)
+def test_far_outside_the_box_as_well(seed):
+    z = np.random.default_rng(seed).uniform(-100.0, 100.0, EMBEDDING.size)
+    table = EMBEDDING.decode(z)
+    assert table.max_albedo() <= 1.0 + 1e-3
+    np.testing.assert_array_equal(table.values, EMBEDDING.decode(EMBEDDING.clip(z)).values)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 50.0, 1e4, 1e30])
+def test_extreme_offsets_stay_passive(size):
+    rng = np.random.default_rng(0)
+    offset = (size * rng.normal(size=(GRID.size, 3))).astype(np.float32)
+    for z in (CENTRE, EMBEDDING.low_, EMBEDDING.high_):
+        for given_offset in (offset, np.full_like(offset, size), np.full_like(offset, -size)):
+            values = EMBEDDING.decode_values(z, given_offset)
+            table = TabulatedBRDF(GRID, values.reshape(*GRID.shape, 3))
+            assert table.max_albedo() <= 1.0 + 1e-3
+
+
+@few
+@given(seeds)
+def test_decoded_tables_are_reciprocal(seed):
+    assert EMBEDDING.decode(in_the_box(seed)).reciprocity_error(512) < 1e-5
+
+
+def test_the_library_is_passive():
+    for z in LIBRARY.coordinates[::10]:
+        assert EMBEDDING.decode(z).max_albedo() <= 1.0 + 1e-3
+
+
+# -- scattered measurements -------------------------------------------------------------------
+
+
+def random_angles(rng, count):
+    """Angles of random pairs of directions within 75 degrees of the normal."""
+    theta_h, theta_d = rng.uniform(0.0, 1.0, (2, 8 * count)) * math.pi / 2
+    theta_h = theta_h**2 / (math.pi / 2)  # crowded at the highlight, as the table is
+    phi_d = rng.uniform(0.0, 2.0 * math.pi, 8 * count)
+    lower = np.cos(theta_h) * np.cos(theta_d)
+    lower = lower - np.sin(theta_h) * np.sin(theta_d) * np.abs(np.cos(phi_d))
+    kept = np.flatnonzero(lower > math.cos(math.radians(75.0)))[:count]
+    return theta_h[kept], theta_d[kept], phi_d[kept]
+
+
+def test_samples_recover_a_member():
+    errors = []
+    for i in range(0, len(LIBRARY), 16):
+        table = LIBRARY[LIBRARY.names[i]]
+        angles = random_angles(np.random.default_rng(i), 2000)
+        index, weight = GRID.stencil(*angles)
+        rgb = np.einsum("nk,nkc->nc", weight, table.values.reshape(-1, 3)[index])
+        again = EMBEDDING.decode_values(EMBEDDING.encode_samples(*angles, rgb))
+        shown = np.einsum("nk,nkc->nc", weight, again[index])
+        errors.append(np.median(np.abs(np.log(shown + FLOOR) - np.log(rgb + FLOOR))))
+    assert np.median(errors) < 0.02
+    assert max(errors) < 0.08
+
+
+def test_masked_rows_do_not_count():
+    table = LIBRARY["gold-polished"]
+    angles = random_angles(np.random.default_rng(0), 500)
+    index, weight = GRID.stencil(*angles)
+    rgb = np.einsum("nk,nkc->nc", weight, table.values.reshape(-1, 3)[index])
+    z = EMBEDDING.encode_samples(*(a[:300] for a in angles), rgb[:300])
+    rgb[300:350] = np.nan
+    rgb[350:400, 1] = -1.0
+    rgb[400:, 2] = np.inf
+    np.testing.assert_allclose(EMBEDDING.encode_samples(*angles, rgb), z, atol=1e-9)
+    broken = angles[0].copy()
+    rgb[:] = 0.1
+    broken[300:] = np.nan
+    np.testing.assert_allclose(
+        EMBEDDING.encode_samples(broken, *angles[1:], rgb),
+        EMBEDDING.encode_samples(*(a[:300] for a in angles), rgb[:300]),
+        atol=1e-9,
+    )
+
+
+def test_one_sample_stays_near_the_mean():
+    z = EMBEDDING.encode_samples([0.3], [0.5], [1.0], [[0.2, 0.2, 0.2]])
+    assert np.all(np.abs(z) < 10.0)
+    assert np.abs(z.reshape(3, -1)[1:]).max() < 1e-9  # grey
+
+
+def test_measured_slices(shared_data):
+    """Real materials from the phi_d = 90 degrees slice alone, on the slice."""
+    with np.load(shared_data / "merl_slices" / "merl_phi_d_90.npz") as data:
+        slices = data["values"]
+    theta_h, theta_d = np.meshgrid(
+        (np.arange(90) / 90) ** 2 * math.pi / 2, np.arange(90) / 90 * math.pi / 2, indexing="ij"
+    )
+    trusted = np.cos(theta_h) * np.cos(theta_d) > math.cos(math.radians(75.0))
+    angles = theta_h[trusted], theta_d[trusted], np.full(trusted.sum(), math.pi / 2)
+    index, weight = GRID.stencil(*angles)
+    errors = []
+    for values in slices:
+        rgb = values[trusted].astype(np.float64)
+        table = EMBEDDING.decode_values(EMBEDDING.encode_samples(*angles, rgb))
+        shown = np.einsum("nk,nkc->nc", weight, table[index])
+        difference = np.log(shown + FLOOR) - np.log(np.maximum(rgb, 0.0) + FLOOR)
+        errors.append(np.median(np.abs(difference)))
+    print(f"|d log f| on {len(errors)} measured slices: median {np.median(errors):.3f}, "
+          f"95 % {np.percentile(errors, 95):.3f}, worst {max(errors):.3f}")  # fmt: skip
+    assert np.median(errors) < 0.12
+
+
+# -- the library ------------------------------------------------------------------------------
+
+
+def test_the_default_library():
+    assert len(LIBRARY) >= 150
+    assert len(set(LIBRARY.families)) >= 6
+    assert len(set(LIBRARY.names)) == len(LIBRARY) == len(LIBRARY.families)
+    assert LIBRARY.coordinates.shape == (len(LIBRARY), EMBEDDING.size)
+    assert list(LIBRARY) == list(LIBRARY.names)
+    assert "blue-plastic" in LIBRARY
+    assert "no such thing" not in LIBRARY
+    table = LIBRARY["blue-plastic"]
+    assert table.name == "blue-plastic"
+    np.testing.assert_array_equal(
+        table.values, EMBEDDING.decode(LIBRARY.coordinates[LIBRARY.index("blue-plastic")]).values
+    )
+    red, _, blue = table.albedo(math.radians(30.0))
+    assert blue > 1.2 * red
+    assert default_library() is LIBRARY
+    assert default_embedding() is LIBRARY.embedding
+    assert "materials" in repr(LIBRARY)
+    assert "k=24" in repr(EMBEDDING)
+
+
+def test_an_unknown_material_names_near_ones():
+    with pytest.raises(ValueError, match="unknown material 'blue-plastik'.*'blue-plastic'"):
+        LIBRARY["blue-plastik"]
+
+
+def test_a_library_needs_coordinates_for_every_name():
+    with pytest.raises(ValueError, match="coordinates"):
+        Library(EMBEDDING, ["a", "b"], np.zeros((3, EMBEDDING.size)), ["x", "y"])
+
+
+# -- fitting and errors -----------------------------------------------------------------------
+
+
+def test_a_small_fit_reproduces_its_tables():
+    grid = HalfDiffGrid(20, 8, 4)
+    embedding = small_embedding(grid, 3)
+    assert embedding.size == 9
+    assert 0.9 < embedding.explained_variance_ratio_.sum() <= 1.0 + 1e-6
+    table = TabulatedBRDF.from_model(Lambert((0.8, 0.5, 0.3)), grid)
+    again = embedding.decode(embedding.encode(table))
+    assert np.median(np.abs(again.values / table.values - 1.0)) < 0.2
+    assert np.all(embedding.low_ <= embedding.high_)
+
+
+def test_fitting_is_deterministic():
+    first, second = small_embedding(), small_embedding()
+    for name, value in first.arrays().items():
+        np.testing.assert_array_equal(second.arrays()[name], value)
+
+
+def test_fit_errors():
+    tables = [TabulatedBRDF.from_model(Lambert(k), HalfDiffGrid(8, 4, 3)) for k in (0.1, 0.5)]
+    other = TabulatedBRDF.from_model(Lambert(0.3), HalfDiffGrid(8, 4, 4))
+    with pytest.raises(ValueError, match="at least two"):
+        BRDFEmbedding().fit(tables[:1])
+    with pytest.raises(ValueError, match="one grid"):
+        BRDFEmbedding(2).fit([*tables, other])
+    with pytest.raises(ValueError, match="n_components"):
+        BRDFEmbedding(6).fit(tables)
+    merl = [TabulatedBRDF(HalfDiffGrid(8, 4, 4, "merl"), np.full((8, 4, 4, 3), f)) for f in (1, 2)]
+    with pytest.raises(ValueError, match="folded"):
+        BRDFEmbedding(2).fit(merl)
+    for count in (0, -1, 2.0, "3", None):
+        with pytest.raises(ValueError, match="n_components"):
+            BRDFEmbedding(count)
+
+
+def test_identical_tables_span_nothing():
+    tables = [TabulatedBRDF.from_model(Lambert(0.5), HalfDiffGrid(8, 4, 3))] * 3
+    with pytest.raises(ValueError, match="different channels"):
+        BRDFEmbedding(1).fit(tables)
+
+
+def test_an_unfitted_embedding_says_so():
+    fresh = BRDFEmbedding(3)
+    assert "n_components=3" in repr(fresh)
+    for call in (
+        lambda: fresh.encode(Lambert(0.5)),
+        lambda: fresh.decode(np.zeros(9)),
+        lambda: fresh.decode_values(np.zeros(9)),
+        lambda: fresh.encode_samples([0.1], [0.1], [0.1], [[1.0, 1.0, 1.0]]),
+        lambda: fresh.residual(LIBRARY["gold-polished"]),
+        fresh.arrays,
+    ):
+        with pytest.raises(ValueError, match="not fitted"):
+            call()
+
+
+@pytest.mark.parametrize("z", [np.zeros(23), np.zeros((1, 24)), 0.0, [math.nan] * 24, [1e400] * 24])
+def test_bad_coordinates(z):
+    with pytest.raises(ValueError, match="z: expected"):
+        EMBEDDING.decode(z)
+    with pytest.raises(ValueError, match="z: expected"):
+        EMBEDDING.clip(z)
+
+
+def test_what_cannot_be_encoded():
+    for thing in ("gold", None, np.zeros(24)):
+        with pytest.raises(TypeError, match="brdf: expected"):
+            EMBEDDING.encode(thing)
+
+
+def test_bad_offsets():
+    with pytest.raises(ValueError, match="offset"):
+        EMBEDDING.decode_values(CENTRE, np.zeros((5, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("angles", "rgb", "match"),
+    [
+        (([0.1], [0.1], [0.1]), [0.1, 0.1, 0.1], "rgb"),
+        (([0.1], [0.1], [0.1]), [[0.1, 0.1]], "rgb"),
+        (([0.1, 0.2], [0.1], [0.1]), [[0.1, 0.1, 0.1]], "theta_h"),
+        (([0.1], [0.1, 0.2], [0.1]), [[0.1, 0.1, 0.1]], "theta_d"),
+        (([0.1], [0.1], 0.1), [[0.1, 0.1, 0.1]], "phi_d"),
+        (([0.1], [0.1], [0.1]), [[-0.1, 0.1, 0.1]], "at least one valid"),
+        (([math.nan], [0.1], [0.1]), [[0.1, 0.1, 0.1]], "at least one valid"),
+        (([], [], []), np.zeros((0, 3)), "at least one valid"),
+    ],
+)
+def test_bad_samples(angles, rgb, match):
+    with pytest.raises(ValueError, match=match):
+        EMBEDDING.encode_samples(*angles, rgb)

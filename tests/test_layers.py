@@ -1,0 +1,158 @@
+"""The floors of the house: which module may import which. Adding a module means adding it here."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "traitbrdf"
+
+FLOORS = (
+    ("directions", "formats"),
+    ("models", "brdf", "measured", "lights", "shapes"),
+    ("embedding", "traits", "strokes", "scene"),
+    ("reference", "transport", "fitting"),
+    ("editing",),
+    ("bench",),
+    ("studio", "cli"),
+)
+FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
+ARRAYS_ONLY = ("traits", "strokes")
+"""Modules that know no BRDF and no scene: they import the ground floor alone."""
+
+HOMES = {
+    "OpenEXR": {"formats"},
+    "sklearn": {"embedding", "traits"},
+    "embreex": {"shapes"},
+    "trimesh": {"shapes"},
+}
+"""Where else's package may be imported."""
+
+
+def module_of(path: Path) -> str:
+    """The module or sub-package, by its name in FLOORS, that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(source: str, package: str) -> set[str]:
+    """Dotted names of all that is imported anywhere, under TYPE_CHECKING and in functions too.
+
+    `from a import b` counts as a.b, since b may be a module; `package` resolves relative imports.
+    """
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = package.split(".")
+                parents = parents[: len(parents) - node.level + 1]
+                base = ".".join([*parents, base]).rstrip(".")
+            found |= {f"{base}.{alias.name}" for alias in node.names}
+    return found
+
+
+def files() -> list[Path]:
+    return sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
+
+
+def imports_of(path: Path) -> set[str]:
+    package = ".".join(path.relative_to(ROOT).parent.parts)
+    return imports(path.read_text(encoding="utf-8"), package)
+
+
+def house_imports(path: Path) -> set[str]:
+    """The modules of this package that a file imports; "" for the package's public names."""
+    names = set()
+    for name in imports_of(path):
+        first, _, rest = name.partition(".")
+        if first == "traitbrdf":
+            names.add(rest.partition(".")[0])
+    return names
+
+
+everywhere = pytest.mark.parametrize("path", files(), ids=lambda p: str(p.relative_to(PACKAGE)))
+
+
+def test_imports_are_found_in_every_form():
+    source = (
+        "import a.b\nfrom c import d\nfrom . import e\nfrom .f import g\nfrom ..h import i\n"
+        "if TYPE_CHECKING:\n    import j\ndef k():\n    import l as m\n"
+    )
+    expected = {"a.b", "c.d", "top.sub.e", "top.sub.f.g", "top.h.i", "j", "l"}
+    assert imports(source, "top.sub") == expected
+
+
+def test_the_package_is_found():
+    assert {"directions", "formats", "brdf", "lights"} <= {module_of(p) for p in files()}
+
+
+@everywhere
+def test_every_module_has_its_floor(path):
+    assert module_of(path) in FLOOR, f"add {module_of(path)} to FLOORS"
+
+
+@everywhere
+def test_imports_go_down(path):
+    own = module_of(path)
+    assert own in FLOOR, f"add {own} to FLOORS"
+    names = house_imports(path) - {own}
+    if FLOOR[own] == len(FLOORS) - 1:
+        names -= {""}  # the public names stand above all but the top floor
+    for name in names:
+        assert name in FLOOR, f"{own} imports traitbrdf.{name}, which is on no floor"
+        assert FLOOR[name] < FLOOR[own], f"{own} imports {name} from its own or a higher floor"
+
+
+@everywhere
+def test_array_modules_know_no_brdf(path):
+    if module_of(path) in ARRAYS_ONLY:
+        assert house_imports(path) <= set(FLOORS[0])
+
+
+@everywhere
+def test_the_package_does_not_need_its_recipes(path):
+    assert not {name for name in imports_of(path) if name.split(".")[0] == "data_gen"}
+
+
+@everywhere
+def test_outside_packages_stay_in_their_homes(path):
+    for name in imports_of(path):
+        homes = HOMES.get(name.split(".")[0])
+        assert homes is None or module_of(path) in homes, f"{module_of(path)} imports {name}"
+
+
+def test_recipes_import_what_the_package_has():
+    for path in sorted((ROOT / "data_gen").rglob("*.py")):
+        assert house_imports(path) <= {*FLOOR, ""}, path
+
+
+def test_no_module_is_a_drawer():
+    for path in files():
+        for part in path.relative_to(PACKAGE).parts:
+            for word in ("util", "helper", "common", "manager", "misc"):
+                assert word not in part.lower(), path
+
+
+def test_public_names_are_few_and_listed():
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    listed = [
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        and any(isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets)
+    ]
+    assert len(listed) == 1, "__init__.py has to state __all__ once"
+    names = listed[0]
+    assert len(names) == len(set(names)) <= 25
+    bound = {
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+    } | {t.id for node in tree.body if isinstance(node, ast.Assign) for t in node.targets}
+    assert set(names) <= bound

@@ -1,0 +1,383 @@
+"""The oracle against closed forms, against itself refined, and against the laws of light."""
+
+from __future__ import annotations
+
+import math
+import types
+
+import numpy as np
+import pytest
+
+from traitbrdf import reference
+from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF, albedo_of, hemisphere_nodes
+from traitbrdf.directions import from_half_diff_angles, reflect, to_local
+from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight, turn_about_y
+from traitbrdf.models import (
+    GGX,
+    Lambert,
+    NormalizedPhong,
+    OrenNayar,
+    PerfectMirror,
+    Plastic,
+    Sheen,
+    TorranceSparrowSimplified,
+)
+
+# resolves the sharpest lobe here, width 0.002, where the nodes of a table do not
+FINE = np.unique(np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 60), np.linspace(0.05, 1.57, 60)]))
+
+
+def points(count, seed=0, min_cos=0.15):
+    """Random normals (n, 3), and views whose cosine is uniform from min_cos to 1."""
+    rng = np.random.default_rng(seed)
+    normals, across = rng.normal(size=(2, count, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    across -= np.sum(across * normals, axis=-1, keepdims=True) * normals
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    cos = rng.uniform(min_cos, 1.0, (count, 1))
+    return normals, cos * normals + np.sqrt(1.0 - cos * cos) * across
+
+
+def random_map(rows=8, seed=0):
+    return EnvironmentMap(np.random.default_rng(seed).random((rows, 2 * rows, 3)) ** 6)
+
+
+def cosine(normals, views):
+    return np.sum(normals * views, axis=-1)
+
+
+# ---------------------------------------------------------------------------------------------
+# closed forms
+
+
+def test_furnace_shows_the_albedo():
+    level = np.array([2.0, 1.0, 0.5])
+    environment = EnvironmentMap.uniform(level, rows=8)
+    normals, views = points(3)
+    models = [Lambert((0.9, 0.5, 0.1)), GGX(alpha=0.3), GGX(alpha=0.08, k=3.0), OrenNayar(0.5, 0.6)]
+    values, _ = reference.radiance(normals, views, models, environment)
+    np.testing.assert_allclose(
+        values[:, 0], np.broadcast_to(level * (0.9, 0.5, 0.1), (3, 3)), rtol=1e-4
+    )
+    for p, theta in enumerate(np.arccos(cosine(normals, views))):
+        for b in (1, 2, 3):
+            expected = level * albedo_of(models[b].eval, theta)
+            np.testing.assert_allclose(values[p, b], expected, rtol=3e-4)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [NormalizedPhong(k_s=1.0, s=5000.0), TorranceSparrowSimplified(k_s=1.0, s=0.002)],
+    ids=["phong", "torrance-sparrow"],
+)
+def test_sharp_lobes_in_the_furnace(model):
+    environment = EnvironmentMap.uniform(rows=16)
+    normals, views = points(3, seed=1, min_cos=0.3)
+    values, _ = reference.radiance(normals, views, [model], environment, tolerance=1e-4)
+    for p, cos in enumerate(cosine(normals, views)):
+        th, td, pd, weight = hemisphere_nodes(math.acos(cos), FINE, per_interval=4, azimuths=64)
+        wi, wo = from_half_diff_angles(th, td, pd)
+        expected = weight @ model.eval(wi, wo)
+        np.testing.assert_allclose(values[p, 0], expected, rtol=1e-4)
+
+
+def test_sharp_lobe_under_a_map_with_edges():
+    """Half the sky lit: a lobe that the edge halves shows half of its albedo."""
+    image = np.zeros((8, 16, 3))
+    image[:, 8:] = 1.0  # from -z over +x to +z
+    model = TorranceSparrowSimplified(k_s=1.0, s=0.002)
+    normal, view = np.array([[0.0, 1.0, 0.0]]), np.array([[0.0, 0.8, 0.6]])
+    half, _ = reference.radiance(normal, view, [model], EnvironmentMap(image))
+    whole, _ = reference.radiance(normal, view, [model], EnvironmentMap.uniform(rows=8))
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["studio", "forest"])
+def test_lambert_shows_the_irradiance_of_real_maps(shared_data, name):
+    environment = EnvironmentMap.read(shared_data / "envmaps" / f"{name}.exr").rotated(0.7)
+    # `irradiance` lets the horizon cut no texel: smaller texels, the same light
+    fine = EnvironmentMap(environment.image.repeat(3, axis=0).repeat(3, axis=1), 0.7)
+    normals, views = points(3, seed=2)
+    k_d = np.array([0.9, 0.5, 0.1])
+    values, error = reference.radiance(normals, views, [Lambert(tuple(k_d))], environment)
+    expected = fine.irradiance(normals) * k_d / math.pi
+    difference = np.abs(values[:, 0] - expected)
+    assert np.all(difference <= 1e-4 * expected.max(axis=-1, keepdims=True))
+    np.testing.assert_allclose(values[:, 0], environment.irradiance(normals) * k_d / math.pi, 1e-3)
+    assert np.all(error[:, 0].max(-1) <= 1e-4 * values[:, 0].max(-1))
+
+
+def test_perfect_mirror_shows_the_texel():
+    environment = random_map().rotated(0.4)
+    normals, views = points(8)
+    k_s = (1.0, 0.5, 0.25)
+    values, error = reference.radiance(normals, views, [PerfectMirror(k_s)], environment)
+    np.testing.assert_allclose(values[:, 0], environment.radiance(reflect(views, normals)) * k_s)
+    np.testing.assert_array_equal(error, 0.0)
+
+
+def test_mirror_adds_to_the_rest():
+    environment = random_map()
+    normals, views = points(2)
+    parts = [Lambert(0.3), PerfectMirror(0.5)]
+    values, _ = reference.radiance(normals, views, [*parts, parts[0] + parts[1]], environment)
+    np.testing.assert_allclose(values[:, 2], values[:, 0] + values[:, 1])
+
+
+def test_point_and_directional_lights_are_closed_form():
+    normals, views = points(50, seed=3)
+    positions = np.random.default_rng(0).random((50, 3))
+    lamp = PointLight((2.0, 3.0, 2.0), (40.0, 20.0, 10.0))
+    sun = DirectionalLight((1.0, 1.0, 0.5), (3.0, 2.0, 1.0))
+    model = GGX(alpha=0.3) + Lambert(0.4)
+    for light in (lamp, sun):
+        values, error = reference.radiance(
+            normals, views, [model], lights=[light], positions=positions
+        )
+        offset = np.array(lamp.position) - positions
+        squared = np.sum(offset**2, axis=-1, keepdims=True)
+        toward = offset / np.sqrt(squared) if light is lamp else np.array(sun.direction)
+        across = np.array(lamp.intensity) / squared if light is lamp else np.array(sun.irradiance)
+        wi, wo = to_local(np.broadcast_to(toward, (50, 3)), normals), to_local(views, normals)
+        expected = model.eval(wi, wo) * across * np.maximum(wi[:, 2:], 0.0)
+        np.testing.assert_allclose(values[:, 0], expected, rtol=1e-10, atol=1e-14)
+        np.testing.assert_array_equal(error, 0.0)
+    both, _ = reference.radiance(normals, views, [model], lights=[lamp, sun], positions=positions)
+    one, _ = reference.radiance(normals, views, [model], lights=[lamp], positions=positions)
+    np.testing.assert_allclose(both, one + values, rtol=1e-12)
+
+
+def test_point_lights_need_positions():
+    normals, views = points(1)
+    with pytest.raises(ValueError, match="positions: point lights need"):
+        reference.radiance(normals, views, [Lambert()], lights=[PointLight((0, 0, 0))])
+    reference.radiance(normals, views, [Lambert()], lights=[DirectionalLight((0, 1, 0))])
+
+
+# ---------------------------------------------------------------------------------------------
+# laws
+
+
+def test_radiance_is_linear_in_the_light():
+    first, second = random_map(seed=1), random_map(seed=2)
+    mixed = EnvironmentMap(2.0 * first.image.astype(float) + 0.5 * second.image.astype(float))
+    normals, views = points(3, seed=4)
+    models = [GGX(alpha=0.1), Lambert(0.5)]
+    a, b, c = (reference.radiance(normals, views, models, e)[0] for e in (first, second, mixed))
+    np.testing.assert_allclose(c, 2.0 * a + 0.5 * b, rtol=3e-4)
+
+
+def test_radiance_is_linear_in_the_table():
+    grid = HalfDiffGrid(20, 8, 5)
+    first = TabulatedBRDF.from_model(GGX(alpha=0.2), grid, dtype=np.float64)
+    second = TabulatedBRDF.from_model(Sheen(), grid, dtype=np.float64)
+    mixed = TabulatedBRDF(grid, 2.0 * first.values + 3.0 * second.values)
+    normals, views = points(2, seed=5)
+    values, _ = reference.radiance(normals, views, [first, second, mixed], random_map())
+    np.testing.assert_allclose(values[:, 2], 2.0 * values[:, 0] + 3.0 * values[:, 1], rtol=1e-12)
+
+
+def test_a_table_is_what_its_eval_says():
+    """Tables share a path of their own through the integrator: it must not matter."""
+    table = TabulatedBRDF.from_model(Plastic(alpha=0.2), HalfDiffGrid(20, 8, 5))
+    other = TabulatedBRDF.from_model(Lambert(0.2), HalfDiffGrid(10, 6, 12, "merl"))
+    disguised = types.SimpleNamespace(eval=table.eval, mirror=table.mirror)
+    normals, views = points(2, seed=6)
+    values, _ = reference.radiance(normals, views, [other, disguised, table], random_map())
+    np.testing.assert_allclose(values[:, 1], values[:, 2], rtol=1e-9)
+    alone, _ = reference.radiance(normals, views, [other], random_map())
+    np.testing.assert_allclose(values[:, :1], alone, rtol=1e-4)
+
+
+@pytest.mark.parametrize("angle", [0.5, -2.0, 7.0])
+def test_rotating_the_map_rotates_the_lookup(angle):
+    environment = random_map(seed=3)
+    normals, views = points(2, seed=7)
+    models = [GGX(alpha=0.1) + PerfectMirror(0.2), Lambert(0.5)]
+    turned, _ = reference.radiance(
+        turn_about_y(normals, angle), turn_about_y(views, angle), models, environment.rotated(angle)
+    )
+    still, _ = reference.radiance(normals, views, models, environment)
+    np.testing.assert_allclose(turned, still, rtol=1e-6)
+
+
+def test_no_light_gives_nothing():
+    normals, views = points(3)
+    models = [Lambert(), GGX(alpha=0.01), TorranceSparrowSimplified(s=0.002), PerfectMirror()]
+    black = EnvironmentMap(np.zeros((4, 8, 3)))
+    for environment in (black, None):
+        values, error = reference.radiance(normals, views, models, environment)
+        np.testing.assert_array_equal(values, 0.0)
+        np.testing.assert_array_equal(error, 0.0)
+
+
+def test_light_below_the_horizon_gives_nothing():
+    image = np.zeros((8, 16, 3))
+    image[4:] = 1.0
+    normal, view = np.array([[0.0, 1.0, 0.0]]), np.array([[0.0, 0.6, 0.8]])
+    models = [Lambert(), GGX(alpha=0.01), PerfectMirror()]
+    values, _ = reference.radiance(normal, view, models, EnvironmentMap(image))
+    np.testing.assert_allclose(values, 0.0, atol=1e-14)
+
+
+def test_light_that_only_grazes_the_surface():
+    """One lit row, whose middle lies below the horizon; its upper part still shines."""
+    image = np.zeros((9, 2, 3))
+    image[4] = 1.0  # polar angles from 80 to 100 degrees
+    tilt = math.radians(-2.0)
+    normal = np.array([[0.0, math.cos(tilt), math.sin(tilt)]])
+    values, _ = reference.radiance(normal, normal, [Lambert(1.0)], EnvironmentMap(image))
+    t = np.radians(80.0 + 20.0 * (np.arange(2000) + 0.5) / 2000)
+    p = 2.0 * math.pi * (np.arange(4000) + 0.5) / 4000
+    cos = np.cos(t)[:, None] * normal[0, 1] + np.sin(t)[:, None] * np.cos(p) * normal[0, 2]
+    band = np.sum(np.maximum(cos, 0.0) * np.sin(t)[:, None]) * math.radians(0.01)
+    expected = band * (2.0 * math.pi / 4000) / math.pi
+    np.testing.assert_allclose(values[0, 0], expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize("row", [0, 7])
+def test_texels_at_the_poles_are_not_lost_at_the_horizon(row):
+    """A polar texel reaches further from its middle than half of its height."""
+    image = np.zeros((8, 16, 3))
+    image[row, 3] = 1.0
+    environment = EnvironmentMap(image)
+    middle = math.pi / 16 if row == 0 else math.pi * 15 / 16
+    azimuth = 2.0 * math.pi * 3.5 / 16
+    t = middle + math.pi / 2 * (1 if row == 0 else -1) * 1.1  # the middle is out of sight
+    normal = np.array(
+        [[-math.sin(t) * math.sin(azimuth), math.cos(t), math.sin(t) * math.cos(azimuth)]]
+    )
+    values, _ = reference.radiance(normal, normal, [Lambert(1.0)], environment)
+    n = 1000
+    ts = (np.arange(n) + 0.5) / n * math.pi / 8 + row * math.pi / 8
+    ps = 2.0 * math.pi * (3 + (np.arange(n) + 0.5) / n) / 16
+    s = np.sin(ts)[:, None]
+    w = np.stack(np.broadcast_arrays(-s * np.sin(ps), np.cos(ts)[:, None], s * np.cos(ps)), axis=-1)
+    cell = (math.pi / 8 / n) * (2.0 * math.pi / 16 / n)
+    expected = np.sum(np.maximum(w @ normal[0], 0.0) * s) * cell / math.pi
+    assert expected > 0.0
+    np.testing.assert_allclose(values[0, 0], expected, rtol=1e-3)
+
+
+# ---------------------------------------------------------------------------------------------
+# the stated error
+
+
+def refined(environment, normals, views, models, resolution=0.05):
+    evaluate = reference._Evaluator(models)
+    return np.array(
+        [
+            reference._integrate(environment, n, v, evaluate, resolution)
+            for n, v in zip(normals, views, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_stated_error_contains_the_truth(monkeypatch, seed):
+    environment = random_map(seed=seed) if seed else EnvironmentMap.sky(rows=16)
+    models = [
+        Lambert(0.5),
+        GGX(alpha=0.02),
+        GGX(alpha=0.4),
+        NormalizedPhong(s=20.0),
+        TabulatedBRDF.from_model(GGX(alpha=0.1) + Lambert(0.2), HalfDiffGrid(40, 16, 7)),
+    ]
+    normals, views = points(2, seed=seed)
+    values, error = reference.radiance(normals, views, models, environment, tolerance=1e-4)
+    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    truth = refined(environment, normals, views, models)
+    assert np.all(np.abs(values - truth) <= error)
+    assert np.all(error.max(-1) <= 1e-4 * values.max(-1))
+
+
+def test_a_grazing_view_meets_the_tolerance(monkeypatch):
+    normals, views = points(1, min_cos=0.05)
+    cos = 0.06
+    across = views[0] - cosine(normals, views) * normals[0]
+    views = cos * normals + math.sqrt(1 - cos * cos) * across / np.linalg.norm(across)
+    environment, models = random_map(), [GGX(alpha=0.1), Lambert(0.5)]
+    values, error = reference.radiance(normals, views, models, environment)
+    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    truth = refined(environment, normals, views, models, 0.08)
+    assert np.all(np.abs(values - truth) <= error)
+
+
+def test_a_looser_tolerance_is_met_and_stated():
+    normals, views = points(2, seed=9)
+    models = [GGX(alpha=0.05)]
+    values, error = reference.radiance(normals, views, models, random_map(), tolerance=1e-2)
+    better, _ = reference.radiance(normals, views, models, random_map(), tolerance=1e-4)
+    assert np.all(np.abs(values - better) <= error)
+    assert np.all(error.max(-1) <= 1e-2 * values.max(-1))
+
+
+def test_refuses_rather_than_lies(monkeypatch):
+    normals, views = points(2)
+    monkeypatch.setattr(reference, "_MAX_CELLS", 500)
+    with pytest.raises(reference.IntegrationError, match="point 0: more than 500 cells needed"):
+        reference.radiance(normals, views, [GGX(alpha=0.01)], random_map())
+
+
+def test_refuses_what_no_mesh_resolves(monkeypatch):
+    """A reflectance that is noise never converges: it must end, and in a refusal."""
+    monkeypatch.setattr(reference, "_MAX_CELLS", 40_000)
+    rng = np.random.default_rng(0)
+    noise = types.SimpleNamespace(eval=lambda wi, wo: rng.random(wi.shape), mirror=np.zeros(3))
+    normals, views = points(1)
+    with pytest.raises(reference.IntegrationError):
+        reference.radiance(normals, views, [noise], random_map(), tolerance=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------
+# frames
+
+
+def test_render_places_the_points():
+    """By part, over the backdrop, each covered pixel as `radiance` has it."""
+    environment = random_map()
+    normals, views = points(3)
+    scene = types.SimpleNamespace(
+        parts=("lid", "body", "unseen"),
+        pixels=np.array([5, 0, 3]),
+        pixel_part=np.array([0, 1, 1]),
+        normals=normals,
+        views=views,
+        positions=np.zeros((3, 3)),
+        environment=environment,
+        lights=(PointLight((0.0, 5.0, 0.0), (9.0, 9.0, 9.0)),),
+        backdrop=lambda: np.full((2, 3, 3), 7.0, np.float32),
+    )
+    brdfs = {"lid": Lambert(0.9), "body": Lambert(0.3), "unseen": Lambert(0.1)}
+    image = reference.render(scene, brdfs)
+    assert image.shape == (2, 3, 3)
+    assert image.dtype == np.float64
+    flat = image.reshape(-1, 3)
+    np.testing.assert_array_equal(flat[[1, 2, 4]], 7.0)
+    values, _ = reference.radiance(
+        normals,
+        views,
+        [Lambert(0.9), Lambert(0.3)],
+        environment,
+        scene.lights,
+        scene.positions,
+    )
+    np.testing.assert_allclose(flat[[5, 0, 3]], values[[0, 1, 2], [0, 1, 1]], rtol=1e-4)
+    np.testing.assert_allclose(reference.render(scene, Lambert(0.3)).reshape(-1, 3)[0], flat[0])
+
+
+def test_relative_error_is_the_mean_over_the_mean():
+    truth = np.array([[1.0, 2.0, 3.0]])
+    assert reference.relative_error(truth, truth) == 0.0
+    assert abs(reference.relative_error(truth + np.array([0.3, -0.3, 0.0]), truth) - 0.1) < 1e-15
+    assert reference.relative_error(np.zeros(3), np.zeros(3)) == 0.0
+    with pytest.raises(ValueError, match=r"expected the reference's shape \(3,\), got \(4,\)"):
+        reference.relative_error(np.zeros(4), np.zeros(3))
+
+
+def test_psnr_of_the_tone_mapped_picture():
+    truth = np.random.default_rng(0).random((20, 20, 3))
+    assert reference.tone_mapped_psnr(truth, truth) == 99.0
+    noise = np.random.default_rng(1).normal(size=truth.shape)
+    near, far = (reference.tone_mapped_psnr(truth + s * noise, truth) for s in (0.01, 0.1))
+    assert 10.0 < far < near < 60.0

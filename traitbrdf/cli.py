@@ -1,0 +1,383 @@
+"""The command line: ``traitbrdf demo | paint | render | info | bench``.
+
+Exit status: 0 done, 1 failed with one readable line, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import traitbrdf as tb
+from traitbrdf import bench
+from traitbrdf.brdf import ALBEDO_ANGLES, Reflectance
+from traitbrdf.formats import exposure_of, tone_map, unknown_name, write_exr, write_png
+from traitbrdf.strokes import follow
+
+DEMO_MATERIAL = "red-rubber"
+DEMO_CAMERA = (-35.0, 20.0, 1.05)
+DEMO_AMOUNT = 0.8
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    parser = _parser()
+    given = parser.parse_args(arguments)
+    try:
+        status: int = given.run(given)
+    except KeyboardInterrupt:
+        print("traitbrdf: interrupted", file=sys.stderr)
+        return 1
+    except (ValueError, TypeError, OSError, RuntimeError, ArithmeticError) as error:
+        message = " ".join(str(error).split()) or type(error).__name__
+        print(f"traitbrdf: {message}", file=sys.stderr)
+        return 1
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="traitbrdf", description="Paint traits, not parameters: edit real materials."
+    )
+    parser.add_argument("--version", action="version", version=f"traitbrdf {tb.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="command")
+
+    demo = commands.add_parser("demo", help="paint 'shiny' on the teapot's handle and see it")
+    _add_scene(demo)
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder (%(default)s)")
+    demo.add_argument("--material", default=DEMO_MATERIAL, help="library name (%(default)s)")
+    demo.set_defaults(run=_demo)
+
+    paint = commands.add_parser("paint", help="one trait edit of one part, to a picture")
+    _add_scene(paint)
+    paint.add_argument("--part", help="part to edit (default: the handle, or the only part)")
+    paint.add_argument(
+        "--trait", action="append", required=True, metavar="NAME=AMOUNT", type=_trait,
+        help="trait and amount, as in shiny=0.6; may be repeated",
+    )  # fmt: skip
+    paint.add_argument(
+        "--hold", action="append", default=[], metavar="TRAIT", help="trait that shall stay"
+    )
+    paint.add_argument("--material", default=DEMO_MATERIAL, help="library name (%(default)s)")
+    paint.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
+    paint.add_argument("--save", type=Path, help="also write the design (.tbr)")
+    paint.set_defaults(run=_paint)
+
+    render = commands.add_parser("render", help="a material, or a saved design, to a picture")
+    _add_scene(render)
+    render.add_argument(
+        "--material", default=DEMO_MATERIAL,
+        help="library name, or a MERL .binary or RGL .bsdf file (%(default)s)",
+    )  # fmt: skip
+    render.add_argument("--design", type=Path, help="a design saved as .tbr; replaces the scene")
+    render.add_argument("--reference", action="store_true", help="by the oracle: slow, exact")
+    render.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
+    render.set_defaults(run=_render)
+
+    info = commands.add_parser("info", help="what the package ships, or what a file holds")
+    info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
+    info.set_defaults(run=_info)
+
+    timing = commands.add_parser("bench", help="errors and times, measured in one run")
+    timing.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(bench.BENCHES)} (default: all)"
+    )
+    timing.add_argument("--quick", action="store_true", help="small sizes, under a minute")
+    timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records")
+    timing.add_argument(
+        "--data", type=Path, help="folder with envmaps/ and rgl/ ($TRAITBRDF_SHARED)"
+    )
+    timing.set_defaults(run=_bench)
+    return parser
+
+
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a procedural sky")
+    parser.add_argument("--shape", choices=("teapot", "sphere"), default="teapot")
+    parser.add_argument("--size", type=_size, default=512, help="pixels (%(default)s)")
+    parser.add_argument(
+        "--camera", type=float, nargs=3, default=DEMO_CAMERA,
+        metavar=("AZIMUTH", "ELEVATION", "ZOOM"), help="degrees, degrees, factor",
+    )  # fmt: skip
+
+
+def _size(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 8 <= value <= 4096:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 8 to 4096, got {text!r}")
+    return value
+
+
+def _trait(text: str) -> tuple[str, float]:
+    name, _, amount = text.partition("=")
+    try:
+        value = float(amount)
+    except ValueError:
+        value = math.nan
+    if not name or not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected NAME=AMOUNT, as in shiny=0.6, got {text!r}")
+    return name, value
+
+
+def _scene(given: argparse.Namespace) -> tb.Scene:
+    environment = tb.EnvironmentMap.sky() if given.env is None else tb.EnvironmentMap.read(given.env)
+    shape = tb.teapot() if given.shape == "teapot" else tb.sphere()
+    azimuth, elevation, zoom = given.camera
+    if given.shape == "sphere" and tuple(given.camera) == DEMO_CAMERA:
+        zoom = 1.0
+    camera = tb.Camera.orbit(azimuth, elevation, zoom=zoom)
+    return tb.Scene(shape, environment, camera=camera, size=given.size)
+
+
+def _write(path: Path, image: NDArray[np.float32], exposure: float | None = None) -> None:
+    if path.suffix.lower() == ".exr":
+        write_exr(path, image)
+    elif path.suffix.lower() == ".png":
+        write_png(path, tone_map(image, exposure_of(image) if exposure is None else exposure))
+    else:
+        raise ValueError(f"--out: expected a name that ends in .png or .exr, got {str(path)!r}")
+
+
+def _check_out(path: Path) -> None:
+    """Refuse an output that cannot be written before any work is done."""
+    if path.suffix.lower() not in (".png", ".exr"):
+        raise ValueError(f"--out: expected a name that ends in .png or .exr, got {str(path)!r}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+class _Progress:
+    """A line on standard error that says what is being done, on a terminal only."""
+
+    def __init__(self) -> None:
+        self.shown = sys.stderr.isatty()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if self.shown:
+            print(f"\r{stage}: {100 * fraction:3.0f} %  ", end="", file=sys.stderr, flush=True)
+
+    def done(self) -> None:
+        if self.shown:
+            print("\r" + " " * 40 + "\r", end="", file=sys.stderr, flush=True)
+
+
+def _prepared(scene: tb.Scene) -> tb.EditSession:
+    progress = _Progress()
+    session = tb.EditSession(scene, progress=progress)
+    session.prepare()
+    progress.done()
+    return session
+
+
+def _demo(given: argparse.Namespace) -> int:
+    given.out.mkdir(parents=True, exist_ok=True)
+    tb.default_library().index(given.material)
+    seconds: dict[str, float] = {}
+
+    def step(name: str, start: float) -> float:
+        now = time.perf_counter()
+        seconds[name] = now - start
+        return now
+
+    clock = time.perf_counter()
+    scene = _scene(given)
+    clock = step("scene", clock)
+    light = "a procedural sky" if given.env is None else given.env.name
+    print(
+        f"{given.shape} under {light}, {scene.width}x{scene.height}, "
+        f"{100 * scene.coverage:.0f} % covered ({seconds['scene']:.2f} s)"
+    )
+    session = _prepared(scene)
+    clock = step("preparation", clock)
+    print(f"light transport prepared ({seconds['preparation']:.1f} s)")
+    session.assign(scene.parts, given.material)
+    before = session.render()
+    clock = step("first frame", clock)
+    print(f"all parts made of {given.material} ({1e3 * seconds['first frame']:.1f} ms)")
+    part = "handle" if given.shape == "teapot" else "sphere"
+    inside = scene.part_image == scene.parts.index(part)
+    if not inside.any():
+        raise ValueError(f"the {part} is not in view: choose another --camera")
+    points, radius = follow(inside)
+    clock = time.perf_counter()
+    score = session.scores(part)["shiny"]
+    moved = session.paint(tb.Stroke(points, trait="shiny", amount=DEMO_AMOUNT, radius=radius))
+    risen = session.scores(part)["shiny"] - score
+    clock = step("stroke", clock)
+    after = session.render()
+    step("frame after the stroke", clock)
+    outside = ~inside
+    changed = int(np.count_nonzero((before != after).any(axis=-1) & outside))
+    print(
+        f"painted 'shiny' {DEMO_AMOUNT:+g} on "
+        + ", ".join(f"the {name} ({amount:+.3f})" for name, amount in moved.items())
+        + f" ({1e3 * seconds['stroke']:.2f} ms); its score rose by {risen:.3f}, "
+        f"{100 * risen / DEMO_AMOUNT:.0f} % of what was asked"
+    )
+    print(
+        f"frame after the stroke: {1e3 * seconds['frame after the stroke']:.2f} ms; pixels "
+        f"changed outside the {part}: {changed} of {int(outside.sum())}"
+    )
+    report = session.report()
+    print(
+        f"frame error, measured on probe pixels (mean relative L1): "
+        f"{100 * report['frame_error']:.3f} % of the object, "
+        f"{100 * report['parts'][part]['error']:.3f} % of the {part}"
+    )
+    exposure = exposure_of(before)
+    pictures = tone_map(before, exposure), tone_map(after, exposure)
+    write_png(given.out / "before.png", pictures[0])
+    write_png(given.out / "after.png", pictures[1])
+    stroke = tb.Stroke(points, trait="shiny", amount=DEMO_AMOUNT, radius=radius)
+    drawn = _draw_stroke(pictures[0], stroke)
+    write_png(given.out / "side_by_side.png", np.concatenate([drawn, pictures[1]], axis=1))
+    write_exr(given.out / "after.exr", after)
+    report["demo"] = {
+        "asked": DEMO_AMOUNT,
+        "risen": risen,
+        "changed_outside": changed,
+        "seconds": seconds,
+        "exposure": exposure,
+    }
+    (given.out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+    names = "before.png, after.png, side_by_side.png, after.exr, report.json"
+    print(f"wrote {names} to {given.out}")
+    return 0
+
+
+def _draw_stroke(picture: NDArray[np.uint8], stroke: tb.Stroke) -> NDArray[np.uint8]:
+    """The picture with the stroke's brush laid over it in yellow."""
+    cover = stroke.coverage(*picture.shape[:2])[..., None]
+    yellow = np.array([255.0, 214.0, 10.0])
+    alpha = np.where(cover > 0.0, 0.35 + 0.45 * cover, 0.0)
+    blended: NDArray[np.uint8] = (picture * (1.0 - alpha) + yellow * alpha + 0.5).astype(np.uint8)
+    return blended
+
+
+def _paint(given: argparse.Namespace) -> int:
+    _check_out(given.out)
+    scene = _scene(given)
+    part = given.part or ("handle" if "handle" in scene.parts else scene.parts[0])
+    session = tb.EditSession(scene)
+    session.assign(scene.parts, given.material)
+    before = session.scores(part)
+    session.move(part, hold=tuple(given.hold), **dict(given.trait))
+    after = session.scores(part)
+    image = session.render()
+    _write(given.out, image)
+    if given.save:
+        session.save(given.save)
+    report = session.report()
+    changes = ", ".join(f"{n} {before[n]:+.2f} -> {after[n]:+.2f}" for n, _ in given.trait)
+    print(
+        f"{part}: {changes}; frame error {100 * report['frame_error']:.3f} %; wrote {given.out}"
+    )
+    return 0
+
+
+def _render(given: argparse.Namespace) -> int:
+    _check_out(given.out)
+    if given.design is not None:
+        session = tb.EditSession.load(given.design)
+    else:
+        material = _material(given.material)
+        session = tb.EditSession(_scene(given))
+        session.assign(session.scene.parts, material)
+    start = time.perf_counter()
+    if given.reference:
+        parts = session.scene.parts
+        image = tb.reference.render(session.scene, {p: session.brdf(p) for p in parts})
+        _write(given.out, image.astype(np.float32))
+        error = "error below 0.01 % by its own estimate"
+    else:
+        _write(given.out, session.render())
+        error = f"frame error {100 * session.report()['frame_error']:.3f} %"
+    print(f"{error}; {time.perf_counter() - start:.1f} s; wrote {given.out}")
+    return 0
+
+
+def _material(name: str) -> str | Reflectance:
+    suffix = Path(name).suffix.lower()
+    if suffix == ".binary":
+        return tb.TabulatedBRDF.read(name)
+    if suffix == ".bsdf":
+        return tb.MeasuredBRDF.read(name)
+    tb.default_library().index(name)
+    return name
+
+
+def _info(given: argparse.Namespace) -> int:
+    library = tb.default_library()
+    embedding, space = library.embedding, tb.default_traits()
+    if given.file is None:
+        kept = float(embedding.explained_variance_ratio_.sum())
+        print(f"traitbrdf {tb.__version__}")
+        print(f"library: {len(library)} materials of {len(set(library.families))} families")
+        print(
+            f"embedding: {embedding.size} coordinates ({embedding.n_components} a colour axis), "
+            f"{100 * kept:.2f} % of the variance of log f, grid {embedding.grid_.shape}"
+        )
+        print(f"traits: {', '.join(space.names)}")
+        print("materials: " + ", ".join(library.names))
+        return 0
+    suffix = given.file.suffix.lower()
+    if suffix in (".binary", ".bsdf"):
+        brdf: Any = _material(str(given.file))
+        table = (
+            brdf if suffix == ".binary" else tb.TabulatedBRDF.from_model(brdf, embedding.grid_)
+        )
+        print(f"{given.file}: {table!r}")
+        for angle, albedo in zip(ALBEDO_ANGLES[::5], table.albedo(ALBEDO_ANGLES[::5]), strict=True):
+            print(f"albedo at {math.degrees(angle):2.0f} degrees: {np.round(albedo, 4).tolist()}")
+        scores = space.score(embedding.encode(table))
+        print("scores: " + ", ".join(f"{n} {s:.2f}" for n, s in scores.items()))
+    elif suffix in (".exr", ".hdr", ".pic"):
+        environment = tb.EnvironmentMap.read(given.file)
+        image = environment.image
+        up = environment.irradiance(np.array([0.0, 1.0, 0.0]))
+        print(f"{given.file}: {image.shape[0]} rows by {image.shape[1]} columns")
+        print(f"radiance: mean {image.mean():.4g}, largest {image.max():.4g}")
+        print(f"irradiance on the ground: {np.round(up, 4).tolist()}")
+        print(f"negative texels set to 0: {environment.clipped_texels}")
+    elif suffix == ".tbr":
+        session = tb.EditSession.load(given.file)
+        print(f"{given.file}: {session.scene!r}")
+        for part in session.scene.parts:
+            print(f"{part}: {session.material(part).name}")
+        print("\n".join(session.history))
+    else:
+        known = (".binary", ".bsdf", ".exr", ".hdr", ".pic", ".tbr")
+        raise ValueError(unknown_name("kind of file", suffix, known))
+    return 0
+
+
+def _bench(given: argparse.Namespace) -> int:
+    for name in given.names:
+        if name not in bench.BENCHES:
+            raise ValueError(unknown_name("bench", name, tuple(bench.BENCHES)))
+    if given.data is not None and not given.data.is_dir():
+        raise FileNotFoundError(f"--data: no such folder: {given.data}")
+    if given.json is not None:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+    data = given.data or bench.default_data()
+    if data is None:
+        print("no folder of real maps and materials: under the procedural sky, without RGL")
+    records = bench.run(given.names, data, given.quick, lambda line: print(line, flush=True))
+    if given.json is not None:
+        given.json.write_text(json.dumps([r.as_dict() for r in records], indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
