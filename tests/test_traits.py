@@ -36,17 +36,15 @@ def at_a_wall(z):
     return bool(np.any((z <= LOW + 1e-9) | (z >= HIGH - 1e-9)))
 
 
-def opposed(name, hold):
-    """Whether holding `hold` leaves no freedom to move `name`."""
-    held = {member for group in hold for member in GROUPS.get(group, (group,))}
-    opposite = {"shiny": "matte", "matte": "shiny"}.get(name)
-    return name in held or opposite in held
+def held_by(name, hold):
+    """Whether `name` is among what is held."""
+    return any(name in GROUPS.get(group, (group,)) for group in hold)
 
 
 @laws
 @given(members, names, amounts, holds)
 def test_a_move_changes_its_score_by_the_amount_and_no_held_one(z, name, amount, hold):
-    if opposed(name, hold):
+    if held_by(name, hold):
         return
     moved = SPACE.move(z, {name: amount}, hold)
     assert np.all((moved >= LOW) & (moved <= HIGH))
@@ -63,7 +61,7 @@ def test_a_move_changes_its_score_by_the_amount_and_no_held_one(z, name, amount,
 @laws
 @given(members, names, st.lists(amounts, min_size=2, max_size=5), holds)
 def test_scores_are_monotone_in_the_amount(z, name, several, hold):
-    if opposed(name, hold):
+    if held_by(name, hold):
         return
     several = sorted(several)
     reached = [SPACE.score(SPACE.move(z, {name: a}, hold))[name] for a in several]
@@ -156,7 +154,7 @@ def test_the_nine_traits_mean_what_they_say():
     assert at["red-rubber"]["red"] > 0.7
     assert at["white-plaster"]["bright"] > 0.7 > 0.3 > at["black-velvet"]["bright"]
     for entry in at.values():
-        assert entry["shiny"] + entry["matte"] == pytest.approx(1.0, abs=0.05)
+        assert entry["shiny"] + entry["matte"] == pytest.approx(1.0, abs=0.2)
 
 
 def test_moves_do_to_the_table_what_they_say():
@@ -188,13 +186,26 @@ def test_moves_do_to_the_table_what_they_say():
         ({"shiny": 0.5}, ("shiny",), ValueError, "'shiny' cannot be moved and held"),
         ({"red": 0.5}, ("colour",), ValueError, "'red' cannot be moved and held"),
         ({"red": 0.0}, "color", ValueError, "'red' cannot be moved and held"),
-        ({"shiny": 0.5}, ("matte",), ValueError, "depend on each other"),
-        ({"shiny": 0.5, "matte": 0.5}, (), ValueError, "cannot move"),
     ],
 )
 def test_bad_moves(asked, hold, error, match):
     with pytest.raises(error, match=match):
         SPACE.move(INNER[0], asked, hold)
+
+
+@pytest.mark.parametrize(
+    ("asked", "hold"), [({"a": 0.5}, ("c",)), ({"a": 0.5, "c": 0.5}, ()), ({"a": 1.0}, ("d", "b"))]
+)
+def test_holds_that_forbid_the_move(asked, hold):
+    """c is the contrary of a, and d is a + b: neither can stay alone."""
+    normals = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+    space = TraitSpace(
+        "abcd", normals, [[0.0, 1.0]] * 4, np.eye(3), np.full(3, -2.0), np.full(3, 2.0)
+    )
+    with pytest.raises(ValueError, match="depend on each other"):
+        space.move(np.zeros(3), asked, hold)
+    np.testing.assert_allclose(space.move(np.zeros(3), {"a": 0.5, "c": -0.5}), [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(space.move(np.zeros(3), {"a": 1.0}, "b"), [1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("z", [np.zeros(3), np.zeros((1, 24)), [math.nan] * 24, 1.0])

@@ -216,7 +216,7 @@ class TraitSpace:
                 break  # the free coordinates alone cannot do what is asked
             step = np.zeros_like(z)
             step[free] = _step(metric, rows, wanted)
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 room = np.where(step > 0.0, (self.high - z) / step, (self.low - z) / step)
             room = np.where(step == 0.0, np.inf, np.maximum(room, 0.0))
             way = min(left, float(room.min()))
