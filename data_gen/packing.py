@@ -63,4 +63,3 @@ def build(
         "coordinates": coordinates,
         "labels": np.stack([marks[name] for name in space.names]),
     }
-

@@ -109,8 +109,9 @@ def test_atomic_path_follows_a_link(tmp_path):
 
 
 def test_atomic_path_refuses_wrong_places(tmp_path):
-    with pytest.raises(FileNotFoundError, match="missing"), formats.atomic_path(
-        tmp_path / "missing" / "a.exr"
+    with (
+        pytest.raises(FileNotFoundError, match="missing"),
+        formats.atomic_path(tmp_path / "missing" / "a.exr"),
     ):
         pass
     with pytest.raises(IsADirectoryError), formats.atomic_path(tmp_path):
@@ -183,9 +184,7 @@ def test_exr_content_decides_not_the_extension(tmp_path):
     np.testing.assert_array_equal(formats.read_image(tmp_path / "a.hdr"), image())
 
 
-@pytest.mark.parametrize(
-    ("half", "value"), [(True, 7e4), (True, -65520.0), (False, 1e39)]
-)
+@pytest.mark.parametrize(("half", "value"), [(True, 7e4), (True, -65520.0), (False, 1e39)])
 def test_exr_refuses_what_the_precision_cannot_hold(tmp_path, half, value):
     pixels = np.full((2, 2, 3), value)
     with pytest.raises(ValueError, match="expected values below"):
@@ -362,9 +361,7 @@ def test_radiance_scanlines(tmp_path, style):
     pixels = rgbe(7, 300)
     if style == "old":  # 299 = 43 + 256 repetitions of the first pixel of each row
         pixels[:] = pixels[:, 1:2]
-        body = b"".join(
-            row[0].tobytes() + bytes((1, 1, 1, 43, 1, 1, 1, 1)) for row in pixels
-        )
+        body = b"".join(row[0].tobytes() + bytes((1, 1, 1, 43, 1, 1, 1, 1)) for row in pixels)
     else:
         body = new_style(pixels) if style == "new" else pixels.tobytes()
     (tmp_path / "a.hdr").write_bytes(radiance(body, "-Y 7 +X 300"))
@@ -391,8 +388,15 @@ def test_radiance_truncated_anywhere(tmp_path, style):
     pixels = rgbe(4, 40)
     body = new_style(pixels) if style == "new" else pixels.tobytes()
     data = radiance(body, "-Y 4 +X 40")
-    for count in (3, 12, 30, len(data) - len(body) - 3, len(data) - len(body) + 2,
-                  len(data) - 50, len(data) - 1):
+    for count in (
+        3,
+        12,
+        30,
+        len(data) - len(body) - 3,
+        len(data) - len(body) + 2,
+        len(data) - 50,
+        len(data) - 1,
+    ):
         (tmp_path / "cut.hdr").write_bytes(data[:count])
         with pytest.raises(FormatError, match=r"cut\.hdr: expected"):
             formats.read_image(tmp_path / "cut.hdr")

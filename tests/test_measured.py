@@ -61,10 +61,12 @@ def _integral(density):
 
 
 def _bilinear(table, x, y):
-    rows = np.array([np.interp(x * (table.shape[1] - 1), np.arange(table.shape[1]), r)
-                     for r in table])
-    return np.array([np.interp(y * (table.shape[0] - 1), np.arange(table.shape[0]), c)
-                     for c in rows.T]).T
+    rows = np.array(
+        [np.interp(x * (table.shape[1] - 1), np.arange(table.shape[1]), r) for r in table]
+    )
+    return np.array(
+        [np.interp(y * (table.shape[0] - 1), np.arange(table.shape[0]), c) for c in rows.T]
+    ).T
 
 
 def test_warp_survives_rows_without_mass():
@@ -150,16 +152,22 @@ PAIRS = (
 )
 INDEPENDENT = {
     "acrylic_felt_purple": [
-        [0.052757, 0.014934, 0.064966], [0.097711, 0.038423, 0.11682],
-        [0.038131, 0.0075077, 0.04916], [0.044317, 0.0093076, 0.055945],
+        [0.052757, 0.014934, 0.064966],
+        [0.097711, 0.038423, 0.11682],
+        [0.038131, 0.0075077, 0.04916],
+        [0.044317, 0.0093076, 0.055945],
     ],
     "chm_light_blue": [
-        [58.477, 62.669, 64.357], [1.7501, 4.2826, 5.0905],
-        [0.02368, 0.028442, 0.032762], [0.0060491, 0.0068868, 0.011135],
+        [58.477, 62.669, 64.357],
+        [1.7501, 4.2826, 5.0905],
+        [0.02368, 0.028442, 0.032762],
+        [0.0060491, 0.0068868, 0.011135],
     ],
     "vch_golden_yellow": [
-        [8.2552, 4.2121, 0.0], [6.0778, 3.2525, 0.19472],
-        [0.014623, 0.015268, 0.0047915], [0.010862, 0.011982, 0.0034642],
+        [8.2552, 4.2121, 0.0],
+        [6.0778, 3.2525, 0.19472],
+        [0.014623, 0.015268, 0.0047915],
+        [0.010862, 0.011982, 0.0034642],
     ],
 }
 
@@ -181,8 +189,9 @@ def test_real_materials_are_physical(shared_data, name):
     assert np.isfinite(f).all()
     assert f.min() >= 0.0
     np.testing.assert_array_equal(f, brdf.eval(wo, wi))
-    turn = np.array([[math.cos(1.0), -math.sin(1.0), 0], [math.sin(1.0), math.cos(1.0), 0],
-                     [0, 0, 1]])
+    turn = np.array(
+        [[math.cos(1.0), -math.sin(1.0), 0], [math.sin(1.0), math.cos(1.0), 0], [0, 0, 1]]
+    )
     np.testing.assert_allclose(brdf.eval(wi @ turn.T, wo @ turn.T), f, rtol=1e-6, atol=1e-9)
     # the measurements themselves break 1 by 0.6 % at worst; beyond 80 degrees they are
     # extrapolated and the division by the cosine carries them up to 2 at 89.5 degrees

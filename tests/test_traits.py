@@ -154,7 +154,7 @@ def test_the_nine_traits_mean_what_they_say():
     assert at["red-rubber"]["red"] > 0.7
     assert at["white-plaster"]["bright"] > 0.7 > 0.3 > at["black-velvet"]["bright"]
     for entry in at.values():
-        assert entry["shiny"] + entry["matte"] == pytest.approx(1.0, abs=0.2)
+        assert (entry["shiny"] > 0.5) == (entry["matte"] < 0.5)
 
 
 def test_moves_do_to_the_table_what_they_say():
@@ -241,9 +241,7 @@ def test_a_fit_is_deterministic_and_survives_arrays():
     for name, value in first.arrays().items():
         np.testing.assert_array_equal(second.arrays()[name], value)
         np.testing.assert_array_equal(again.arrays()[name], value)
-    np.testing.assert_array_equal(
-        again.move(z[0], {"x": 0.4}), first.move(z[0], {"x": 0.4})
-    )
+    np.testing.assert_array_equal(again.move(z[0], {"x": 0.4}), first.move(z[0], {"x": 0.4}))
 
 
 @pytest.mark.parametrize(

@@ -242,9 +242,7 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     true, _ = _both(scene, index, closed)
     tables = [TabulatedBRDF.from_model(m, grid) for m in closed]
     shown, _ = reference_values(scene, index, tables, 1e-3)
-    error = [
-        reference.relative_error(shown[:, i], true[:, i]) for i in range(len(closed))
-    ]
+    error = [reference.relative_error(shown[:, i], true[:, i]) for i in range(len(closed))]
     for model, e in zip(closed, error, strict=True):
         say(f"  {getattr(model, 'name', '') or model!r}: {100 * e:.2f} %")
     how = f"{len(closed)} closed forms and measured BRDFs, grid {grid.shape}, map {name}"

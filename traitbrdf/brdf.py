@@ -59,6 +59,13 @@ class HalfDiffGrid:
     n_theta_h, n_theta_d, n_phi_d : int
         Numbers of nodes, at least 2 each.
     layout : "merl" or "folded"
+
+    Examples
+    --------
+    >>> HalfDiffGrid.merl().shape
+    (90, 90, 180)
+    >>> [round(float(t), 3) for t in HalfDiffGrid(3, 2, 2).theta_h]
+    [0.0, 0.393, 1.571]
     """
 
     n_theta_h: int

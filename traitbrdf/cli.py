@@ -132,7 +132,9 @@ def _trait(text: str) -> tuple[str, float]:
 
 
 def _scene(given: argparse.Namespace) -> tb.Scene:
-    environment = tb.EnvironmentMap.sky() if given.env is None else tb.EnvironmentMap.read(given.env)
+    environment = (
+        tb.EnvironmentMap.sky() if given.env is None else tb.EnvironmentMap.read(given.env)
+    )
     shape = tb.teapot() if given.shape == "teapot" else tb.sphere()
     azimuth, elevation, zoom = given.camera
     if given.shape == "sphere" and tuple(given.camera) == DEMO_CAMERA:
@@ -280,9 +282,7 @@ def _paint(given: argparse.Namespace) -> int:
         session.save(given.save)
     report = session.report()
     changes = ", ".join(f"{n} {before[n]:+.2f} -> {after[n]:+.2f}" for n, _ in given.trait)
-    print(
-        f"{part}: {changes}; frame error {100 * report['frame_error']:.3f} %; wrote {given.out}"
-    )
+    print(f"{part}: {changes}; frame error {100 * report['frame_error']:.3f} %; wrote {given.out}")
     return 0
 
 
@@ -334,9 +334,7 @@ def _info(given: argparse.Namespace) -> int:
     suffix = given.file.suffix.lower()
     if suffix in (".binary", ".bsdf"):
         brdf: Any = _material(str(given.file))
-        table = (
-            brdf if suffix == ".binary" else tb.TabulatedBRDF.from_model(brdf, embedding.grid_)
-        )
+        table = brdf if suffix == ".binary" else tb.TabulatedBRDF.from_model(brdf, embedding.grid_)
         print(f"{given.file}: {table!r}")
         for angle, albedo in zip(ALBEDO_ANGLES[::5], table.albedo(ALBEDO_ANGLES[::5]), strict=True):
             print(f"albedo at {math.degrees(angle):2.0f} degrees: {np.round(albedo, 4).tolist()}")

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.embedding import BRDFEmbedding, Library, default_library
 from traitbrdf.formats import FormatError, read_arrays, unknown_name, write_arrays
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, PointLight
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
@@ -170,9 +170,7 @@ class EditSession:
 
     # -- edits ----------------------------------------------------------------------------------
 
-    def assign(
-        self, part: str | Iterable[str], material: str | Reflectance | ArrayLike
-    ) -> None:
+    def assign(self, part: str | Iterable[str], material: str | Reflectance | ArrayLike) -> None:
         """Give one part (or several) a material.
 
         Parameters
@@ -237,7 +235,7 @@ class EditSession:
             raise ValueError("amounts: expected at least one trait, as in shiny=0.6; got none")
         hold = (hold,) if isinstance(hold, str) else tuple(hold)
         new = self._moved(part, amounts, hold)
-        said = "".join(f", {name}={float(value):+g}" for name, value in amounts.items())
+        said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
         held = f", hold={hold!r}" if hold else ""
         self._do({part: new}, f"edit.move({part!r}{said}{held})")
 
@@ -286,15 +284,13 @@ class EditSession:
             hold = () if stroke.trait in GROUPS["colour"] else ("colour",)
         moved = {name: stroke.amount * weight for name, weight in touched}
         new = {
-            name: self._moved(name, {stroke.trait: amount}, hold)
-            for name, amount in moved.items()
+            name: self._moved(name, {stroke.trait: amount}, hold) for name, amount in moved.items()
         }
-        points = [(round(x, 2), round(y, 2)) for x, y in stroke.points]
         held = "" if stroke.hold is None else f", hold={tuple(stroke.hold)!r}"
         self._do(
             new,
-            f"edit.paint(tb.Stroke({points!r}, trait={stroke.trait!r}, amount={stroke.amount:g}, "
-            f"radius={stroke.radius:g}{held}))",
+            f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
+            f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}))",
         )
         return moved
 
@@ -357,9 +353,7 @@ class EditSession:
         """
         transport = self.prepare()
         start = time.perf_counter()
-        frames = [
-            self._shade(transport, i, part) for i, part in enumerate(self.scene.parts)
-        ]
+        frames = [self._shade(transport, i, part) for i, part in enumerate(self.scene.parts)]
         image = transport.compose(frames)
         result = np.asarray(image.cpu().numpy(), np.float32)
         self._times["frame"] = time.perf_counter() - start
@@ -398,7 +392,7 @@ class EditSession:
             inside = (material.z - self.embedding.low_) / span
             parts[part] = {
                 "material": material.name,
-                "pixels": int(len(frame.radiance)),
+                "pixels": len(frame.radiance),
                 "error": frame.error,
                 "tier": self._frames[part][2],
                 "scores": self.traits.score(material.z),
@@ -411,9 +405,9 @@ class EditSession:
             "frame_error": transport.frame_error(frames),
             "seconds": dict(self._times),
             "image": [self.scene.height, self.scene.width],
-            "covered_pixels": int(len(self.scene.pixels)),
+            "covered_pixels": len(self.scene.pixels),
             "basis_images": transport.rank,
-            "cells_seen": int(len(transport.cells)),
+            "cells_seen": len(transport.cells),
             "cells": self.embedding.grid_.size,
             "bytes": transport.bytes,
             "device": str(self.device),
@@ -461,6 +455,7 @@ class EditSession:
             "size": [scene.height, scene.width],
             "camera": vars(scene.camera),
             "rotation": scene.environment.rotation,
+            "clipped_texels": scene.environment.clipped_texels,
             "lights": [{"kind": type(light).__name__, **vars(light)} for light in scene.lights],
             "materials": materials,
             "history": self.history,
@@ -490,19 +485,28 @@ class EditSession:
             made: Mesh | Sphere
             if shape["kind"] == "mesh":
                 made = Mesh(
-                    *(arrays[f"shape_{n}"] for n in ("vertices", "faces", "normals", "face_part")),
+                    arrays["shape_vertices"],
+                    arrays["shape_faces"],
+                    arrays["shape_normals"],
+                    arrays["shape_face_part"],
                     tuple(shape["parts"]),
                 )
             else:
                 made = sphere(shape["radius"], shape["center"])
-            kinds = {"PointLight": PointLight, "DirectionalLight": DirectionalLight}
-            lights = [kinds[light.pop("kind")](**light) for light in header["lights"]]
+            lights: list[Light] = []
+            for light in header["lights"]:
+                if light.pop("kind") == "PointLight":
+                    lights.append(PointLight(**light))
+                else:
+                    lights.append(DirectionalLight(**light))
+            environment = EnvironmentMap(arrays["environment"], header["rotation"])
+            environment.clipped_texels = int(header["clipped_texels"])
             scene = Scene(
                 made,
-                EnvironmentMap(arrays["environment"], header["rotation"]),
+                environment,
                 lights,
                 Camera(**header["camera"]),
-                tuple(header["size"]),
+                (header["size"][0], header["size"][1]),
             )
             given = {key: header[key] for key in ("quality", "error", "seed")}
             session = cls(scene, **{**given, **settings})

@@ -12,7 +12,6 @@ against magenta; each axis is scaled to unit variance over channels.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 

@@ -181,8 +181,20 @@ def _read_exr(path: PathName) -> Float32:
     return np.stack(planes, axis=-1).astype(np.float32)
 
 
-_EXR_CHUNK_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256, 10: 256,
-                    11: 32}
+_EXR_CHUNK_LINES = {
+    0: 1,
+    1: 1,
+    2: 1,
+    3: 16,
+    4: 32,
+    5: 16,
+    6: 32,
+    7: 32,
+    8: 32,
+    9: 256,
+    10: 256,
+    11: 32,
+}
 
 
 def _check_exr(path: PathName, file: BinaryIO) -> None:
@@ -220,8 +232,11 @@ def _check_exr(path: PathName, file: BinaryIO) -> None:
         x0, y0, x1, y1 = struct.unpack("<4i", attributes[b"dataWindow"])
         (compression,) = attributes[b"compression"]
     except (KeyError, ValueError, struct.error):
-        raise FormatError(path, "an OpenEXR header with dataWindow and compression",
-                          f"{len(attributes)} attributes without them") from None
+        raise FormatError(
+            path,
+            "an OpenEXR header with dataWindow and compression",
+            f"{len(attributes)} attributes without them",
+        ) from None
     width, height = x1 - x0 + 1, y1 - y0 + 1
     if width < 1 or height < 1 or width * height > _MAX_PIXELS:
         raise FormatError(path, f"at most {_MAX_PIXELS} pixels", f"a {width} x {height} image")
@@ -501,7 +516,8 @@ def read_merl(path: PathName) -> Float64:
             plane = np.fromfile(file, "<f8", count)
             if len(plane) < count or not np.isfinite(plane).all():
                 raise FormatError(
-                    path, f"{count} finite values a colour",
+                    path,
+                    f"{count} finite values a colour",
                     f"{int(np.isfinite(plane).sum())} in colour {channel}",
                 )
             values[..., channel] = plane.reshape(dims) * scale
@@ -607,9 +623,7 @@ def read_rgl(path: PathName) -> RGLFields:
     return fields
 
 
-def _tensor_table(
-    path: PathName, file: BinaryIO
-) -> dict[str, tuple[str, int, tuple[int, ...]]]:
+def _tensor_table(path: PathName, file: BinaryIO) -> dict[str, tuple[str, int, tuple[int, ...]]]:
     """The (type, offset, shape) of every field, checked to lie within the file."""
     size = _size(file)
 
@@ -632,7 +646,8 @@ def _tensor_table(
         rank, kind, offset = take("<HBQ")
         if not 1 <= kind <= len(_TENSOR_TYPES) or rank > 8 or name in table:
             raise FormatError(
-                path, "fields of known type, at most 8 axes and different names",
+                path,
+                "fields of known type, at most 8 axes and different names",
                 f"{name!r} of type {kind} with {rank} axes",
             )
         shape = take(f"<{rank}Q")
@@ -640,7 +655,8 @@ def _tensor_table(
         needed = math.prod(shape) * np.dtype(dtype).itemsize
         if offset + needed > size:  # Python integers: no overflow to hide behind
             raise FormatError(
-                path, f"{name} of shape {shape} within the file",
+                path,
+                f"{name} of shape {shape} within the file",
                 f"bytes {offset} to {offset + needed} of {size}",
             )
         table[name] = dtype, offset, shape
@@ -661,7 +677,8 @@ def _check_rgl(path: PathName, fields: RGLFields) -> None:
         got = getattr(fields, name).shape
         if got != shape or min(shape[-2:]) < 2:
             raise FormatError(
-                path, f"{name} of {p} azimuths, {t} elevations, at least 2 x 2 nodes",
+                path,
+                f"{name} of {p} azimuths, {t} elevations, at least 2 x 2 nodes",
                 f"shape {got}",
             )
     for name in ("phi_i", "theta_i"):
@@ -671,7 +688,8 @@ def _check_rgl(path: PathName, fields: RGLFields) -> None:
         raise FormatError(path, "a vndf that is a density", f"a minimum of {fields.vndf.min()}")
     if fields.sigma.min() <= 0.0 or fields.ndf.min() < 0.0:
         raise FormatError(
-            path, "positive sigma and ndf",
+            path,
+            "positive sigma and ndf",
             f"minima of {fields.sigma.min()} and {fields.ndf.min()}",
         )
 

@@ -48,8 +48,10 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("azimuth", "elevation", "fov", "zoom"):
             value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and math.isfinite(value)):
+            number = isinstance(value, (int, float, np.integer, np.floating))
+            if not (number and math.isfinite(value)):
                 raise ValueError(f"{name}: expected a finite number, got {value!r}")
+            object.__setattr__(self, name, float(value))
         if not -90.0 <= self.elevation <= 90.0:
             raise ValueError(f"elevation: expected -90 to 90 degrees, got {self.elevation!r}")
         if not 0.0 < self.fov < 170.0:
@@ -172,9 +174,10 @@ class Scene:
 
 
 def _image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    pair = (size, size) if isinstance(size, (int, np.integer)) else tuple(size)
+    pair = tuple(size) if isinstance(size, (tuple, list, np.ndarray)) else (size, size)
     if len(pair) != 2 or not all(
-        isinstance(s, (int, np.integer)) and 1 <= s <= MAX_SIDE for s in pair
+        isinstance(s, (int, np.integer)) and not isinstance(s, bool) and 1 <= s <= MAX_SIDE
+        for s in pair
     ):
         raise ValueError(
             f"size: expected a whole number of pixels from 1 to {MAX_SIDE}, or (height, width), "

@@ -40,6 +40,13 @@ class Stroke:
     ------
     ValueError, TypeError
         On no points, or numbers that are not finite, or a radius that is not positive.
+
+    Examples
+    --------
+    >>> stroke = Stroke([(2.5, 4.5), (7.5, 4.5)], trait="shiny", amount=0.5, radius=2.0)
+    >>> cover = stroke.coverage(10, 10)
+    >>> float(cover[4, 5]), float(cover[9, 5])
+    (1.0, 0.0)
     """
 
     points: Sequence[tuple[float, float]]

@@ -154,9 +154,7 @@ class TraitSpace:
         values = self._gradient @ self._point(z) + self._offset
         return dict(zip(self.names, values.tolist(), strict=True))
 
-    def move(
-        self, z: ArrayLike, amounts: Mapping[str, float], hold: Iterable[str] = ()
-    ) -> Float64:
+    def move(self, z: ArrayLike, amounts: Mapping[str, float], hold: Iterable[str] = ()) -> Float64:
         """Coordinates (k,) whose scores differ from those of `z` by `amounts`.
 
         Parameters
@@ -171,6 +169,15 @@ class TraitSpace:
         (k,) array inside the gamut box. Where the box ends before the change is complete, the
         coordinates that can still move go on; where none can, the answer is the furthest point
         reached (its `score` says how far that is). Amounts of 0 return `z` as it is.
+
+        Examples
+        --------
+        >>> from traitbrdf import default_library, default_traits
+        >>> library, space = default_library(), default_traits()
+        >>> z = library.coordinates[library.index("red-rubber")]
+        >>> shinier = space.move(z, {"shiny": 0.5}, hold=("colour",))
+        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 6)
+        0.5
 
         Raises
         ------
@@ -192,25 +199,25 @@ class TraitSpace:
         if "body" in hold:
             fixed = np.concatenate([fixed, self.body])
         a = np.concatenate([self._gradient[list(moved)], fixed])
-        wanted = np.concatenate([targets, np.zeros(len(fixed))])
+        # the direction and how far to go along it, lest tiny or huge amounts lose all digits
+        left = float(np.abs(targets).max())
+        wanted = np.concatenate([targets / left, np.zeros(len(fixed))])
         if not _possible(self._metric, a, wanted):
             raise ValueError(
                 f"cannot move {sorted(amounts)} while holding {sorted(hold)}: these scores depend "
                 "on each other; hold fewer traits"
             )
-        z, left = np.clip(start, self.low, self.high), 1.0
+        z = np.clip(start, self.low, self.high)
         if "body" not in hold and any(self.names[i] in KEEPS_BODY for i in moved):
             kept = np.concatenate([a, self.body])
             z, left = self._walk(z, left, kept, np.append(wanted, np.zeros(len(self.body))))
         return self._walk(z, left, a, wanted)[0]
 
-    def _walk(
-        self, z: Float64, left: float, a: Float64, wanted: Float64
-    ) -> tuple[Float64, float]:
-        """Go the fraction `left` of a move, along the shortest step of the coordinates that are
-        not at a wall of the box; returns where that ends and the fraction left."""
+    def _walk(self, z: Float64, left: float, a: Float64, wanted: Float64) -> tuple[Float64, float]:
+        """Go `left` times the change `wanted`, along the shortest step of the coordinates that are
+        not at a wall of the box; returns where that ends and what is left then."""
         free = np.ones(len(z), bool)
-        while left > 1e-12 and free.any():
+        while left > 0.0 and free.any():
             metric, rows = self._metric[np.ix_(free, free)], a[:, free]
             if not _possible(metric, rows, wanted):
                 break  # the free coordinates alone cannot do what is asked
@@ -288,8 +295,6 @@ def _amount(name: str, value: float) -> float:
     if not math.isfinite(amount):
         raise ValueError(f"amount of {name!r}: expected a finite number, got {value!r}")
     return amount
-
-
 
 
 @functools.lru_cache(maxsize=1)

@@ -205,6 +205,7 @@ def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Trai
     fields = _smooth_fields(grid, len(chosen), rng)
     varied = plain[:, chosen] * np.exp(fields)
     weight = np.concatenate([np.ones(plain.shape[1]), np.full(len(chosen), 0.1)])
+    weight[library.shape[1]] = 30.0  # Lambert, the first of the families, lies in every basis
     return Training(np.concatenate([plain, varied], axis=1), weight)
 
 
@@ -289,7 +290,9 @@ class Transport:
             subset = np.sort(shuffled[len(probes) :][: self.TRAINING_ROWS])
             if len(probes) == 0:  # a handful of pixels: nothing can be kept apart
                 probes = subset
-            mix = self._combinations(torch.from_numpy(self.operator.rows(subset)), tables, importance)
+            mix = self._combinations(
+                torch.from_numpy(self.operator.rows(subset)), tables, importance
+            )
             images = []
             for chunk in _chunks(pixels):
                 images.append(self.operator.images(chunk, mix))
@@ -388,7 +391,9 @@ class Transport:
             for t in (p.basis, p.projection, p.probe_rows, p.probe_basis)
         )
 
-    def shade(self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None) -> PartFrame:
+    def shade(
+        self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
+    ) -> PartFrame:
         """Linear radiance of one part's pixels, and its error measured on the probes.
 
         Parameters
@@ -504,7 +509,9 @@ def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any, tex
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _coarse_irradiance(n: Any, moment: Any, direction: Any, radius: Any, child: Any, stack: Any) -> Any:
+def _coarse_irradiance(
+    n: Any, moment: Any, direction: Any, radius: Any, child: Any, stack: Any
+) -> Any:
     """Irradiance (summed over colours) to some percent: what bright nodes are measured against."""
     total = 0.0
     top = 0
