@@ -7,6 +7,7 @@ edits are undone and redone one at a time; a stroke is one edit.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -28,7 +29,7 @@ from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
 from traitbrdf.traits import GROUPS, TraitSpace, default_traits
-from traitbrdf.transport import PartFrame, Progress, Transport, training_tables
+from traitbrdf.transport import PartFrame, Progress, Training, Transport, training_tables
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -330,13 +331,10 @@ class EditSession:
         if self._transport is None:
             start = time.perf_counter()
             rank, resolution = QUALITIES[self.quality]
-            channels = np.concatenate(
-                [self.embedding.decode_values(z) for z in self.library.coordinates], axis=1
-            )
             self._transport = Transport(
                 self.scene,
                 self.embedding.grid_,
-                training_tables(channels, self.embedding.grid_, self.seed),
+                _training(self.library, self.seed),
                 rank=rank,
                 resolution=resolution,
                 seed=self.seed,
@@ -529,6 +527,13 @@ class EditSession:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise FormatError(path, "a design written by EditSession.save", repr(error)) from error
         return session
+
+
+@functools.lru_cache(maxsize=1)
+def _training(library: Library, seed: int) -> Training:
+    """The training set of a library; kept, since every new view or light needs it again."""
+    channels = [library.embedding.decode_values(z) for z in library.coordinates]
+    return training_tables(np.concatenate(channels, axis=1), library.embedding.grid_, seed)
 
 
 def _fingerprint(embedding: BRDFEmbedding) -> str:

@@ -232,11 +232,16 @@ class EnvironmentMap:
 
     def rotated(self, angle: float) -> EnvironmentMap:
         """The map turned further about +y by `angle` radians."""
-        return EnvironmentMap(self.image, self.rotation + angle)
+        return self._like(self.image, self.rotation + angle)
 
     def scaled(self, factor: ArrayLike) -> EnvironmentMap:
         """The map times a factor (scalar or RGB)."""
-        return EnvironmentMap(self.image * np.asarray(factor, np.float32), self.rotation)
+        return self._like(self.image * np.asarray(factor, np.float32), self.rotation)
+
+    def _like(self, image: NDArray[np.float32], rotation: float) -> EnvironmentMap:
+        result = EnvironmentMap(image, rotation)
+        result.clipped_texels = self.clipped_texels
+        return result
 
     @property
     def row_edges(self) -> Float64:
