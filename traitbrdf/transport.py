@@ -520,9 +520,7 @@ def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any, tex
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _coarse_irradiance(
-    n: Any, nodes: Any, child: Any, stack: Any
-) -> Any:
+def _coarse_irradiance(n: Any, nodes: Any, child: Any, stack: Any) -> Any:
     """Irradiance (summed over colours) to some percent: what bright nodes are measured against."""
     total = 0.0
     top = 0
@@ -541,7 +539,9 @@ def _coarse_irradiance(
             for c in range(3):
                 total += max(
                     0.0,
-                    n[0] * nodes[i, 5 + 3 * c] + n[1] * nodes[i, 6 + 3 * c] + n[2] * nodes[i, 7 + 3 * c],
+                    n[0] * nodes[i, 5 + 3 * c]
+                    + n[1] * nodes[i, 6 + 3 * c]
+                    + n[2] * nodes[i, 7 + 3 * c],
                 )
     return max(total, 1e-30)
 
