@@ -95,8 +95,8 @@ def rgl_fields() -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def small_sphere() -> Scene:
-    """A sphere under a coarse sky: some 1,800 pixels."""
-    return Scene(sphere(), EnvironmentMap.sky(rows=32), camera=Camera.orbit(20.0, 10.0), size=48)
+    """A sphere under a coarse sky: some 1,000 pixels."""
+    return Scene(sphere(), EnvironmentMap.sky(rows=32), camera=Camera.orbit(20.0, 10.0), size=36)
 
 
 @pytest.fixture(scope="session")

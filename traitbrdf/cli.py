@@ -297,7 +297,10 @@ def _render(given: argparse.Namespace) -> int:
     start = time.perf_counter()
     if given.reference:
         parts = session.scene.parts
-        image = tb.reference.render(session.scene, {p: session.brdf(p) for p in parts})
+        progress = _Progress()
+        brdfs = {p: session.brdf(p) for p in parts}
+        image = tb.reference.render(session.scene, brdfs, progress=progress)
+        progress.done()
         _write(given.out, image.astype(np.float32))
         error = "error below 0.01 % by its own estimate"
     else:

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.decomposition import PCA
 
 from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, Reflectance, TabulatedBRDF, albedo_operator
 from traitbrdf.formats import artifact, unknown_name
@@ -68,6 +67,8 @@ class BRDFEmbedding:
 
     def fit(self, tables: Sequence[TabulatedBRDF]) -> BRDFEmbedding:
         """Fit to a library of at least two tables on one grid; returns self."""
+        from sklearn.decomposition import PCA  # slow to import, and needed only here
+
         if len(tables) < 2:
             raise ValueError(f"tables: expected at least two, got {len(tables)}")
         grid = tables[0].grid

@@ -10,7 +10,7 @@ quadrature with `traitbrdf.transport`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,30 +92,47 @@ def render(
     scene: Scene,
     brdfs: Reflectance | Mapping[str, Reflectance],
     tolerance: float = 1e-4,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Float64:
     """The whole frame (H, W, 3), linear radiance, backdrop included.
 
     Parameters
     ----------
     brdfs : one reflectance for all parts, or one for each part by name
+    tolerance : of each pixel, relative to its largest channel
+    progress : called with ("reference", fraction done); may raise to cancel
+
+    Raises
+    ------
+    IntegrationError
+        As `radiance` does.
+    ValueError
+        If a part that is seen has no reflectance.
     """
+    if isinstance(brdfs, Mapping):
+        seen = [scene.parts[i] for i in np.unique(scene.pixel_part)]
+        missing = [name for name in seen if name not in brdfs]
+        if missing:
+            raise ValueError(f"brdfs: expected one for each part seen, got none for {missing}")
     image = scene.backdrop().astype(np.float64)
     flat = image.reshape(-1, 3)
+    done = 0
     for index, name in enumerate(scene.parts):
-        inside = scene.pixel_part == index
-        if not inside.any():
-            continue
-        brdf = brdfs[name] if isinstance(brdfs, Mapping) else brdfs
-        values, _ = radiance(
-            scene.normals[inside],
-            scene.views[inside],
-            [brdf],
-            scene.environment,
-            scene.lights,
-            scene.positions[inside],
-            tolerance,
-        )
-        flat[scene.pixels[inside]] = values[:, 0]
+        pixels = np.flatnonzero(scene.pixel_part == index)
+        for some in np.array_split(pixels, math.ceil(len(pixels) / 64)) if len(pixels) else []:
+            values, _ = radiance(
+                scene.normals[some],
+                scene.views[some],
+                [brdfs[name] if isinstance(brdfs, Mapping) else brdfs],
+                scene.environment,
+                scene.lights,
+                scene.positions[some],
+                tolerance,
+            )
+            flat[scene.pixels[some]] = values[:, 0]
+            done += len(some)
+            if progress is not None:
+                progress("reference", done / len(scene.pixels))
     return image
 
 

@@ -19,16 +19,18 @@ from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import embreex.mesh_construction
 import embreex.rtcore_scene
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import as_directions, shading_frame
 from traitbrdf.formats import FormatError
+
+if TYPE_CHECKING:
+    import trimesh
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
@@ -741,6 +743,8 @@ def _obj_corner(word: str, positions: int, normals: int) -> tuple[int, int]:
 
 def _read_trimesh(file: Path) -> list[_Piece]:
     """Parts of a PLY, glTF or glb file, in the order of the file's geometries."""
+    import trimesh  # half a second of imports that most sessions never need
+
     try:
         # unprocessed: trimesh would merge vertices and with them the file's own normals
         scene = trimesh.load(str(file), force="scene", process=False)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.svm import SVC
 
 from traitbrdf.formats import artifact, unknown_name
 
@@ -112,6 +111,8 @@ class TraitSpace:
         ValueError
             If a trait's labels are of one class only, or of a wrong shape.
         """
+        from sklearn.svm import SVC  # slow to import, and needed only here
+
         z = np.asarray(coordinates, np.float64)
         scale = np.maximum(z.std(axis=0), 1e-9)
         normals, typical = [], []

@@ -20,8 +20,9 @@ pixels with the greatest leverage in Q are among them and the rest is drawn at r
 draw errs up to ten times as much on tables outside the training set). (Projecting rho on an
 orthonormal basis of cell space instead errs by tens of percent.)
 
-*Error*. Some more pixels, in neither the fit nor S, keep their exact rows, built at twice the
-resolution: comparing them gives every frame its measured error.
+*Error*. Some pixels, drawn evenly from all that are shown, keep their exact rows, built at twice
+the resolution: comparing them gives every frame its measured error. (Drawing them from outside the
+fit alone would overstate the error of small parts, of which the fit holds most pixels.)
 """
 
 from __future__ import annotations
@@ -262,9 +263,11 @@ class Transport:
         device: str | torch.device = "cpu",
         progress: Progress | None = None,
     ) -> None:
-        if training.tables.ndim != 2 or training.tables.shape[0] != grid.size:
+        shape = training.tables.shape
+        if shape != (grid.size, len(training.weight)) or not len(training.weight):
             raise ValueError(
-                f"training: expected shape ({grid.size}, tables), got {training.tables.shape}"
+                f"training: expected shape ({grid.size}, tables) with a weight for each table, "
+                f"got {shape} and {len(training.weight)} weights"
             )
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
@@ -286,11 +289,8 @@ class Transport:
             if len(pixels) == 0:
                 drafts.append(None)
                 continue
-            shuffled = rng.permutation(pixels)
-            probes = np.sort(shuffled[: min(self.PROBES, len(pixels) // 4)])
-            subset = np.sort(shuffled[len(probes) :][: self.TRAINING_ROWS])
-            if len(probes) == 0:  # a handful of pixels: nothing can be kept apart
-                probes = subset
+            probes = np.sort(rng.permutation(pixels)[: self.PROBES])
+            subset = np.sort(rng.permutation(pixels)[: self.TRAINING_ROWS])
             mix = self._combinations(
                 torch.from_numpy(self.operator.rows(subset)), tables, importance
             )
@@ -300,7 +300,7 @@ class Transport:
                 done += len(chunk)
                 report("basis images", done / total)
             basis = _orthonormal(torch.cat(images, dim=1))
-            fit, weight = self._fit_pixels(basis, pixels, probes, rng)
+            fit, weight = self._fit_pixels(basis, pixels, rng)
             rows = self.operator.rows(fit)
             exact = self.operator.rows(probes, 2.0 * resolution)
             drafts.append(_Draft(pixels, basis, fit, weight, rows, probes, exact))
@@ -322,13 +322,11 @@ class Transport:
         self,
         basis: torch.Tensor,
         pixels: NDArray[np.int64],
-        probes: NDArray[np.int64],
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.int64], Float64]:
         """Pixels and weights of the least-squares fit: a third by leverage, the rest by chance."""
-        candidates = np.setdiff1d(pixels, probes) if len(pixels) > len(probes) else pixels
-        count = min(self.FIT_FACTOR * basis.shape[-1], len(candidates))
-        leverage = (basis.double() ** 2).sum(dim=(0, 2)).numpy()[candidates - pixels[0]]
+        count = min(self.FIT_FACTOR * basis.shape[-1], len(pixels))
+        leverage = (basis.double() ** 2).sum(dim=(0, 2)).numpy()
         order = np.argsort(-leverage, kind="stable")
         leading, others = order[: count // 3], order[count // 3 :]
         drawn = rng.choice(others, count - len(leading), replace=False)
@@ -337,7 +335,7 @@ class Transport:
         share = math.sqrt(len(others) / max(len(drawn), 1))
         weight = np.concatenate([np.ones(len(leading)), np.full(len(drawn), share)])
         ascending = np.argsort(chosen)
-        return candidates[chosen[ascending]], weight[ascending]
+        return pixels[chosen[ascending]], weight[ascending]
 
     def _combinations(
         self, rows: torch.Tensor, tables: torch.Tensor, importance: torch.Tensor
@@ -351,7 +349,7 @@ class Transport:
             weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
             images = images * weight
             # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
-            squares, u = torch.linalg.eigh(images @ images.T)
+            squares, u = _eigh(images @ images.T)
             rank = min(self.rank, len(squares))
             squares, u = squares.flip(0)[:rank], u.flip(1)[:, :rank]
             keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
@@ -366,7 +364,10 @@ class Transport:
         weight = torch.from_numpy(draft.weight)[:, None]
         sampled = basis[:, torch.from_numpy(draft.fit - pixels[0])].double() * weight
         gram = sampled.transpose(1, 2) @ sampled
-        inverse = torch.linalg.pinv(gram, hermitian=True, rtol=1e-9)
+        squares, vectors = _eigh(gram)
+        keep = squares > 1e-9 * squares[:, -1:].clamp_min(1e-30)
+        scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
+        inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
         solve = (inverse @ sampled.transpose(1, 2) * weight.T).float()
         rows = torch.from_numpy(draft.rows)[:, :, seen].permute(1, 0, 2)
         mirror = scene.environment.radiance(reflect(scene.views[pixels], scene.normals[pixels]))
@@ -404,6 +405,8 @@ class Transport:
             f_r at the cells that the scene sees.
         mirror : (3,) weight of a perfect mirror
         """
+        if table.shape != (len(self.cells), 3):
+            raise ValueError(f"table: expected ({len(self.cells)}, 3), got {tuple(table.shape)}")
         known = self.parts[part]
         if known is None:
             empty = torch.zeros((0, 3), device=self.device)
@@ -427,6 +430,8 @@ class Transport:
 
         `table` is (grid.size, 3).
         """
+        if table.shape != (self.grid.size, 3):
+            raise ValueError(f"table: expected ({self.grid.size}, 3), got {table.shape}")
         scene = self.scene
         pixels = np.arange(len(scene.pixels))[scene.part_slice(part)]
         columns = torch.from_numpy(np.ascontiguousarray(table.T[:, :, None]))
@@ -457,6 +462,21 @@ def _per_colour(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.mv(matrices[c], vectors[c]) for c in range(3)])
 
 
+def _eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Eigenvalues, ascending, and eigenvectors, on one thread.
+
+    Several threads would meet at thousands of barriers, and where other work shares the cores each
+    of them costs a time slice: seconds for what one thread does in milliseconds.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        values, vectors = torch.linalg.eigh(symmetric)
+    finally:
+        torch.set_num_threads(threads)
+    return values, vectors
+
+
 def _orthonormal(images: torch.Tensor) -> torch.Tensor:
     """An orthonormal basis (3, P, r) of the columns of images (3, P, r), by their Gram matrix.
 
@@ -465,7 +485,7 @@ def _orthonormal(images: torch.Tensor) -> torch.Tensor:
     basis = images
     for _ in range(2):  # the second pass removes what float32 left of the first
         gram = torch.stack([(b.T @ b).double() for b in basis])
-        values, vectors = torch.linalg.eigh(gram)
+        values, vectors = _eigh(gram)
         keep = values > 1e-6 * values[:, -1:].clamp_min(1e-30)
         scale = torch.where(keep, torch.where(keep, values, 1.0).rsqrt(), 0.0)
         basis = torch.bmm(basis, (vectors * scale[:, None, :]).float())
