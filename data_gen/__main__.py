@@ -31,12 +31,14 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{stage}: {100 * fraction:3.0f} %", end=end, file=sys.stderr, flush=True)
 
     try:
+        if not given.out.parent.is_dir():  # rather than after the work
+            raise FileNotFoundError(f"{given.out}: expected an existing folder")
         arrays = build(given.count, given.seed, given.components, progress)
         write_arrays(given.out, arrays)
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
         return 1
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"data_gen: {error}", file=sys.stderr)
         return 1
     print(

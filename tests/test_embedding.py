@@ -306,7 +306,7 @@ def test_the_default_library():
 
 
 def test_an_unknown_material_names_near_ones():
-    with pytest.raises(ValueError, match="unknown material 'blue-plastik'.*'blue-plastic'"):
+    with pytest.raises(ValueError, match=r"unknown material 'blue-plastik'.*'blue-plastic'"):
         LIBRARY["blue-plastik"]
 
 

@@ -399,13 +399,13 @@ def test_progress_is_told_and_can_cancel(training):
     assert told[-1][1] == 1.0
     assert len({stage for stage, _ in told}) >= 2
 
-    class Cancelled(Exception):
+    class CancelError(Exception):
         pass
 
     def cancel(stage, fraction):
-        raise Cancelled
+        raise CancelError
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelError):
         Transport(scene, GRID, training, rank=8, progress=cancel)
 
 

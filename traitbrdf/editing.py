@@ -7,12 +7,13 @@ edits are undone and redone one at a time; a stroke is one edit.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -187,6 +188,8 @@ class EditSession:
             On something that is no material.
         """
         names = [part] if isinstance(part, str) else list(part)
+        if not names:
+            raise ValueError("part: expected at least one name, got none")
         for name in names:
             self.part(name)
         if isinstance(material, str):
@@ -475,58 +478,88 @@ class EditSession:
             coordinates would mean other materials.
         """
         arrays = read_arrays(path)
-        try:
+        with _design_errors(path):
             header = json.loads(str(arrays["design"]))
             if header["format"] != _FORMAT:
                 raise FormatError(path, f"a design of format {_FORMAT}", f"{header['format']!r}")
-            shape = header["shape"]
-            made: Mesh | Sphere
-            if shape["kind"] == "mesh":
-                made = Mesh(
-                    arrays["shape_vertices"],
-                    arrays["shape_faces"],
-                    arrays["shape_normals"],
-                    arrays["shape_face_part"],
-                    tuple(shape["parts"]),
-                )
-            else:
-                made = sphere(shape["radius"], shape["center"])
-            lights: list[Light] = []
-            for light in header["lights"]:
-                if light.pop("kind") == "PointLight":
-                    lights.append(PointLight(**light))
-                else:
-                    lights.append(DirectionalLight(**light))
-            environment = EnvironmentMap(arrays["environment"], header["rotation"])
-            environment.clipped_texels = int(header["clipped_texels"])
-            scene = Scene(
-                made,
-                environment,
-                lights,
-                Camera(**header["camera"]),
-                (header["size"][0], header["size"][1]),
-            )
+            scene = _saved_scene(header, arrays)
             given = {key: header[key] for key in ("quality", "error", "seed")}
-            session = cls(scene, **{**given, **settings})
+            cls(scene, **given)  # what is wrong in the file is no mistake of the caller
+        session = cls(scene, **{**given, **settings})
+        with _design_errors(path):
             expected = _fingerprint(session.embedding)
             if header["embedding"] != expected:
                 raise FormatError(
                     path, f"a design of embedding {expected}", f"embedding {header['embedding']}"
                 )
+            named = [entry["part"] for entry in header["materials"]]
+            if named != list(scene.parts):
+                raise FormatError(path, f"materials of {list(scene.parts)}", f"{named}")
             for i, entry in enumerate(header["materials"]):
-                session._materials[entry["part"]] = Material(
-                    session.embedding.as_coordinates(arrays[f"z_{i}"]),
-                    arrays[f"mirror_{i}"],
-                    arrays.get(f"offset_{i}"),
-                    arrays.get(f"table_{i}"),
-                    entry["name"],
+                session._materials[entry["part"]] = _saved_material(
+                    i, str(entry["name"]), arrays, session.embedding
                 )
             session._replayed = [str(call) for call in header["history"]]
-        except FormatError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise FormatError(path, "a design written by EditSession.save", repr(error)) from error
         return session
+
+
+@contextlib.contextmanager
+def _design_errors(path: str | PathLike[str]) -> Iterator[None]:
+    """Whatever does not fit while a design is read is the file's fault."""
+    try:
+        yield
+    except FormatError:
+        raise
+    except (
+        KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError
+    ) as error:  # fmt: skip
+        raise FormatError(path, "a design written by EditSession.save", repr(error)) from error
+
+
+def _saved_scene(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Scene:
+    shape = header["shape"]
+    made: Mesh | Sphere
+    if shape["kind"] == "mesh":
+        vertices, faces, normals, face_part = (
+            arrays[f"shape_{name}"] for name in ("vertices", "faces", "normals", "face_part")
+        )
+        made = Mesh(vertices, faces, normals, face_part, tuple(shape["parts"]))
+    else:
+        made = sphere(shape["radius"], shape["center"])
+    lights: list[Light] = []
+    for light in header["lights"]:
+        values = {key: value for key, value in light.items() if key != "kind"}
+        if light["kind"] == "PointLight":
+            lights.append(PointLight(**values))
+        elif light["kind"] == "DirectionalLight":
+            lights.append(DirectionalLight(**values))
+        else:
+            raise ValueError(f"lights: expected point or directional lights, got {light['kind']!r}")
+    environment = EnvironmentMap(arrays["environment"], header["rotation"])
+    environment.clipped_texels = int(header["clipped_texels"])
+    height, width = header["size"]
+    return Scene(made, environment, lights, Camera(**header["camera"]), (height, width))
+
+
+def _saved_material(
+    index: int, name: str, arrays: Mapping[str, NDArray[Any]], embedding: BRDFEmbedding
+) -> Material:
+    offset, table = (arrays.get(f"{kind}_{index}") for kind in ("offset", "table"))
+    shape = (embedding.grid_.size, 3)
+    for kind, value in (("offset", offset), ("table", table)):
+        if value is not None and not (value.shape == shape and np.isfinite(value).all()):
+            raise ValueError(f"{kind}: expected finite numbers of shape {shape}, got {value.shape}")
+    black = np.zeros((*embedding.grid_.shape, 3), np.float32)
+    values = black if table is None else table.reshape(black.shape)
+    # checks the values and the weight
+    mirror = TabulatedBRDF(embedding.grid_, values, arrays[f"mirror_{index}"]).mirror
+    return Material(
+        embedding.as_coordinates(arrays[f"z_{index}"]),
+        mirror,
+        None if offset is None else offset.astype(np.float32),
+        None if table is None else table.astype(np.float32),
+        name,
+    )
 
 
 @functools.lru_cache(maxsize=1)

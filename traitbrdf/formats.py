@@ -721,8 +721,8 @@ def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
             return {name: data[name] for name in data.files}
     except FileNotFoundError:
         raise
-    except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile,
-            zlib.error) as error:  # fmt: skip
+    except (ValueError, TypeError, OSError, EOFError, KeyError, AttributeError,
+            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
         raise FormatError(str(path), "a file of named arrays (.npz)", str(error)) from error
 
 

@@ -1,0 +1,224 @@
+"""The recipe: the shipped artifact is what it makes; labels look at tables alone."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_gen import __main__ as command
+from data_gen import packing
+from data_gen.families import materials
+from data_gen.labels import descriptors, labels, trait_values
+from data_gen.packing import build
+from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.embedding import GRID, BRDFEmbedding
+from traitbrdf.formats import artifact, read_arrays
+from traitbrdf.models import GGX, Lambert, Plastic
+from traitbrdf.traits import TraitSpace
+
+ROOT = Path(__file__).resolve().parents[1]
+COARSE = HalfDiffGrid(45, 12, 5)
+
+
+@pytest.mark.slow
+def test_the_recipe_makes_what_the_package_ships():
+    made, shipped = build(), artifact()
+    assert set(made) == set(shipped)
+    for name in ("names", "families", "trait_names", "grid"):
+        np.testing.assert_array_equal(made[name], shipped[name])
+    np.testing.assert_allclose(made["mean"], shipped["mean"], atol=1e-5)
+    for name in ("coordinates", "low", "high"):
+        np.testing.assert_allclose(made[name], shipped[name], atol=1e-3, err_msg=name)
+    np.testing.assert_allclose(made["components"], shipped["components"], rtol=2e-3, atol=1e-4)
+    # a member on the border between yes and unclear may fall to either side
+    assert np.mean(made["labels"] != shipped["labels"]) < 0.002
+    first = TraitSpace.from_arrays(made).normals
+    second = TraitSpace.from_arrays(shipped).normals
+    cosine = np.sum(first * second, axis=1)
+    cosine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    assert np.all(cosine > 0.999)
+
+
+def test_what_the_package_ships():
+    shipped = artifact()
+    path = ROOT / "traitbrdf" / "data" / "library.npz"
+    assert path.stat().st_size < 8e6
+    assert all(value.dtype.kind in "fiuU" for value in shipped.values())
+    assert all(np.isfinite(v).all() for v in shipped.values() if v.dtype.kind == "f")
+    count = len(shipped["names"])
+    assert count == packing.COUNT
+    assert shipped["coordinates"].shape == (count, 3 * packing.COMPONENTS)
+    assert shipped["labels"].shape == (len(shipped["trait_names"]), count)
+    assert np.all(shipped["coordinates"] >= shipped["low"].astype(np.float32))
+    assert np.all(shipped["coordinates"] <= shipped["high"].astype(np.float32))
+    recipe = list(materials(packing.SEED, count))
+    assert [m.name for m in recipe] == shipped["names"].tolist()
+    assert [m.family for m in recipe] == shipped["families"].tolist()
+    for row in shipped["labels"]:  # a third has it, a third has it not
+        assert abs(np.mean(row == 1) - 1 / 3) < 0.01
+        assert abs(np.mean(row == -1) - 1 / 3) < 0.01
+
+
+@pytest.fixture(scope="module")
+def small():
+    told = []
+    arrays = build(30, seed=3, components=4, progress=lambda *news: told.append(news))
+    return arrays, told
+
+
+def test_a_build_is_deterministic(small):
+    again = build(30, seed=3, components=4)
+    assert list(again) == list(small[0])
+    for name, value in small[0].items():
+        np.testing.assert_array_equal(again[name], value, err_msg=name)
+
+
+def test_a_build_tells_its_progress(small):
+    arrays, told = small
+    assert arrays["coordinates"].shape == (30, 12)
+    assert [fraction for stage, fraction in told if stage == "tabulating"][-1] == 1.0
+    assert told[-1] == ("traits", 1.0)
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in told)
+
+
+def test_a_build_can_be_used(small):
+    embedding = BRDFEmbedding.from_arrays(small[0])
+    space = TraitSpace.from_arrays(small[0])
+    z = embedding.clip(small[0]["coordinates"][5])
+    moved = space.move(z, {"bright": 0.2})
+    assert embedding.decode(moved).max_albedo() <= 1.0 + 1e-3
+
+
+def test_another_seed_makes_other_materials():
+    drawn = [[m.name for m in materials(seed, 150)] for seed in (0, 1)]
+    assert drawn[0] != drawn[1]
+
+
+# -- labels -----------------------------------------------------------------------------------
+
+
+def test_descriptors_look_at_the_table_alone():
+    for i, material in enumerate(materials(0, 60)):
+        if i % 6:
+            continue
+        table = TabulatedBRDF.from_model(material.model, COARSE, material.name)
+        renamed = TabulatedBRDF(COARSE, table.values.copy(), name="something else")
+        assert descriptors(renamed) == descriptors(table)
+        assert all(math.isfinite(v) for v in descriptors(table).values())
+
+
+def test_labels_do_not_depend_on_the_order_of_members():
+    rows = [
+        descriptors(TabulatedBRDF.from_model(m.model, COARSE, m.name)) for m in materials(0, 90)
+    ]
+    order = np.random.default_rng(0).permutation(len(rows))
+    first, second = trait_values(rows), trait_values([rows[i] for i in order])
+    for name, values in first.items():
+        np.testing.assert_array_equal(labels(values)[order], labels(second[name]), err_msg=name)
+
+
+def test_descriptors_say_what_they_say():
+    def of(model):
+        return descriptors(TabulatedBRDF.from_model(model, GRID))
+
+    flat, dark = of(Lambert(0.6)), of(Lambert(0.05))
+    assert flat["highlight"] == pytest.approx(0.0, abs=1e-3)
+    assert flat["width"] == pytest.approx(math.log(math.pi / 4))
+    assert flat["specular"] == pytest.approx(0.0, abs=0.01)
+    assert flat["diffuse"] == pytest.approx(0.6, rel=0.01)
+    assert flat["lightness"] == pytest.approx(0.6 ** (1 / 3), rel=0.01)
+    assert flat["lightness"] > dark["lightness"]
+    assert of(Lambert((0.6, 0.2, 0.2)))["red"] == pytest.approx(math.log(3.0), abs=0.05)
+    assert of(Lambert((0.2, 0.2, 0.6)))["blue"] == pytest.approx(math.log(3.0), abs=0.05)
+    smooth, rough = of(GGX(0.05, 1.5, 0.0)), of(GGX(0.4, 1.5, 0.0))
+    assert smooth["width"] < rough["width"]
+    assert smooth["highlight"] > rough["highlight"] > flat["highlight"]
+    assert of(GGX(0.1, 0.2, 3.9))["specular"] > 0.8
+
+
+def test_the_highlight_of_a_plastic_has_no_tint():
+    red = (0.6, 0.1, 0.1)
+    plastic = TabulatedBRDF.from_model(Plastic(red, 0.05, 1.5), GRID)
+    metal = TabulatedBRDF.from_model(GGX(0.05, 0.2, 3.9, red), GRID)
+    assert descriptors(plastic)["tint"] < 0.05 < descriptors(metal)["tint"]
+
+
+def test_labels_are_thirds():
+    values = np.random.default_rng(0).normal(size=300)
+    marks = labels(values)
+    assert marks.dtype == np.int8
+    assert [np.count_nonzero(marks == m) for m in (-1, 0, 1)] == [100, 100, 100]
+    assert values[marks == 1].min() > values[marks == 0].max()
+    assert values[marks == 0].min() > values[marks == -1].max()
+
+
+# -- the command ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_command_as_a_process(tmp_path):
+    out = tmp_path / "library.npz"
+    shipped = (ROOT / "traitbrdf" / "data" / "library.npz").read_bytes()
+    call = [sys.executable, "-W", "error", "-m", "data_gen", "--count", "40", "--out", str(out)]
+    done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "40 materials, 24 coordinates" in done.stdout
+    assert len(read_arrays(out)["names"]) == 40
+    assert (ROOT / "traitbrdf" / "data" / "library.npz").read_bytes() == shipped
+
+
+def test_an_interruption_leaves_no_file(tmp_path, monkeypatch, capsys):
+    def interrupted(count, seed, components, progress):
+        def stop(stage, fraction):
+            progress(stage, fraction)
+            raise KeyboardInterrupt
+
+        return build(count, seed, components, stop)
+
+    monkeypatch.setattr(command, "build", interrupted)
+    assert command.main(["--count", "40", "--out", str(tmp_path / "library.npz")]) == 1
+    assert list(tmp_path.iterdir()) == []
+    assert "interrupted; nothing was written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["--count", "1"], "tables: expected at least two"),
+        (["--count", "0"], "tables: expected at least two"),
+        (["--count", "-1"], "count"),
+        (["--seed", "-1"], "seed"),
+        (["--count", "4", "--components", "0"], "n_components"),
+        (["--count", "4", "--components", "12"], "n_components"),
+    ],
+)
+def test_one_readable_line_for_a_mistake(tmp_path, capsys, arguments, match):
+    out = tmp_path / "library.npz"
+    assert command.main([*arguments, "--out", str(out)]) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert told[-1].startswith("data_gen: ")
+    assert match in told[-1]
+    assert not out.exists()
+
+
+def test_a_folder_that_is_not_there(tmp_path, capsys, monkeypatch, small):
+    monkeypatch.setattr(command, "build", lambda *arguments: small[0])
+    assert command.main(["--out", str(tmp_path / "nowhere" / "library.npz")]) == 1
+    assert "data_gen: " in capsys.readouterr().err
+    assert command.main(["--components", "4", "--out", str(tmp_path / "library.npz")]) == 0
+    assert "30 materials" in capsys.readouterr().out
+
+
+def test_wrong_usage_and_help(capsys):
+    with pytest.raises(SystemExit) as wrong:
+        command.main(["--count", "many"])
+    assert wrong.value.code == 2
+    with pytest.raises(SystemExit) as asked:
+        command.main(["--help"])
+    assert asked.value.code == 0
+    assert "--count" in capsys.readouterr().out
