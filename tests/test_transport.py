@@ -276,7 +276,7 @@ def test_what_a_build_holds(built):
     assert 0 < len(built.cells) <= GRID.size
     q = built.parts[0].basis
     for c in range(3):
-        torch.testing.assert_close(q[c].T @ q[c], torch.eye(q.shape[-1]), rtol=0.0, atol=1e-3)
+        torch.testing.assert_close(q[c] @ q[c].T, torch.eye(q.shape[1]), rtol=0.0, atol=1e-3)
 
 
 def test_cells_that_nobody_sees_do_not_count(built):

@@ -143,7 +143,7 @@ class _PartBasis:
     """One part's compressed operator."""
 
     pixels: torch.Tensor  # (P,) flat pixel indices
-    basis: torch.Tensor  # Q (3, P, r)
+    basis: torch.Tensor  # Q^T (3, r, P): this way round a product with a vector is fastest
     projection: torch.Tensor  # C (3, r, cells)
     probe_rows: torch.Tensor  # (3, m, cells)
     probe_basis: torch.Tensor  # (3, m, r)
@@ -355,7 +355,7 @@ class Transport:
             keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
             inverse = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
             mix = weight[:, None] * (images.T @ u) * inverse
-            combinations.append((tables.double() @ mix).float())
+            combinations.append(tables @ mix.float())
         return torch.stack(combinations)
 
     def _compress(self, draft: _Draft) -> _PartBasis:
@@ -374,7 +374,7 @@ class Transport:
         move = self.device
         return _PartBasis(
             pixels=torch.from_numpy(scene.pixels[pixels]).to(move),
-            basis=basis.contiguous().to(move),
+            basis=basis.transpose(1, 2).contiguous().to(move),
             projection=torch.bmm(solve, rows).to(move),
             probe_rows=(
                 torch.from_numpy(draft.exact)[:, :, seen].permute(1, 0, 2).contiguous().to(move)
@@ -418,7 +418,7 @@ class Transport:
         shown = _per_colour(known.probe_basis, coefficients).clamp_min(0.0)
         deviation = float((shown - exact).abs().mean())
         level = float(exact.mean())
-        pixels = _per_colour(known.basis, coefficients).T.clamp_min(0.0)
+        pixels = _per_colour(known.basis.transpose(1, 2), coefficients).T.clamp_min(0.0)
         if mirror is not None and bool((mirror > 0.0).any()):
             pixels = pixels + mirror * known.mirror
         return PartFrame(pixels, deviation, level)
