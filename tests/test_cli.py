@@ -17,6 +17,11 @@ from traitbrdf.formats import read_image, write_exr
 MAPS = ("forest", "lobby", "night", "studio", "sunset", "venice", "warehouse", "workshop")
 
 
+def picture(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
 def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """The one line with which a command fails."""
     assert main(arguments) == 1
@@ -49,11 +54,11 @@ def test_demo_under_real_maps(
     assert report["demo"]["changed_outside"] == 0
     assert report["demo"]["risen"] >= 0.9 * report["demo"]["asked"]
     assert report["frame_error"] < 0.01
-    before = np.asarray(Image.open(tmp_path / "before.png"))
-    after = np.asarray(Image.open(tmp_path / "after.png"))
+    assert {part["tier"] for part in report["parts"].values()} == {"basis"}
+    before, after = picture(tmp_path / "before.png"), picture(tmp_path / "after.png")
     assert before.shape == after.shape == (48, 48, 3)
     assert (before != after).any()
-    assert np.asarray(Image.open(tmp_path / "side_by_side.png")).shape == (48, 96, 3)
+    assert picture(tmp_path / "side_by_side.png").shape == (48, 96, 3)
     radiance = read_image(tmp_path / "after.exr")
     assert radiance.shape == (48, 48, 3)
     assert np.isfinite(radiance).all()
@@ -70,7 +75,7 @@ def test_paint_writes_a_picture_and_a_design(
         "--hold", "bright", "--out", str(out), "--save", str(design),
     ]) == 0  # fmt: skip
     assert "lid: shiny" in capsys.readouterr().out
-    assert Image.open(out).size == (32, 32)
+    assert picture(out).shape == (32, 32, 3)
     again = tmp_path / "again.exr"
     assert main(["render", "--design", str(design), "--out", str(again)]) == 0
     session = tb.EditSession.load(design)

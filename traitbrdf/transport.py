@@ -130,7 +130,8 @@ class _Draft:
     """A part while its basis is being made."""
 
     pixels: NDArray[np.int64]
-    basis: torch.Tensor
+    basis: torch.Tensor  # (3, P, r), orthonormal where pixels are damped
+    damping: torch.Tensor  # (3, P, 1)
     fit: NDArray[np.int64]
     weight: Float64
     rows: Float32
@@ -299,11 +300,13 @@ class Transport:
                 images.append(self.operator.images(chunk, mix))
                 done += len(chunk)
                 report("basis images", done / total)
-            basis = _orthonormal(torch.cat(images, dim=1))
+            whole = torch.cat(images, dim=1)
+            damping = _damping(whole, len(subset))
+            basis = _orthonormal(whole * damping)
             fit, weight = self._fit_pixels(basis, pixels, rng)
             rows = self.operator.rows(fit)
             exact = self.operator.rows(probes, 2.0 * resolution)
-            drafts.append(_Draft(pixels, basis, fit, weight, rows, probes, exact))
+            drafts.append(_Draft(pixels, basis, damping, fit, weight, rows, probes, exact))
         # cells that none of these pixels sees are neither decoded nor stored
         seen = np.zeros(grid.size, bool)
         for draft in drafts:
@@ -362,24 +365,27 @@ class Transport:
         pixels, basis, scene = draft.pixels, draft.basis, self.scene
         seen = torch.from_numpy(self.cells)
         weight = torch.from_numpy(draft.weight)[:, None]
-        sampled = basis[:, torch.from_numpy(draft.fit - pixels[0])].double() * weight
+        at = torch.from_numpy(draft.fit - pixels[0])
+        sampled = basis[:, at].double() * weight
+        damped = (draft.damping[:, at] * weight).transpose(1, 2)
+        shown = basis / draft.damping
         gram = sampled.transpose(1, 2) @ sampled
         squares, vectors = _eigh(gram)
         keep = squares > 1e-9 * squares[:, -1:].clamp_min(1e-30)
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
-        solve = (inverse @ sampled.transpose(1, 2) * weight.T).float()
+        solve = (inverse @ sampled.transpose(1, 2) * damped).float()
         rows = torch.from_numpy(draft.rows)[:, :, seen].permute(1, 0, 2)
         mirror = scene.environment.radiance(reflect(scene.views[pixels], scene.normals[pixels]))
         move = self.device
         return _PartBasis(
             pixels=torch.from_numpy(scene.pixels[pixels]).to(move),
-            basis=basis.transpose(1, 2).contiguous().to(move),
+            basis=shown.transpose(1, 2).contiguous().to(move),
             projection=torch.bmm(solve, rows).to(move),
             probe_rows=(
                 torch.from_numpy(draft.exact)[:, :, seen].permute(1, 0, 2).contiguous().to(move)
             ),
-            probe_basis=basis[:, torch.from_numpy(draft.probes - pixels[0])].contiguous().to(move),
+            probe_basis=shown[:, torch.from_numpy(draft.probes - pixels[0])].contiguous().to(move),
             mirror=torch.from_numpy(np.ascontiguousarray(mirror)).to(move),
         )
 
@@ -475,6 +481,17 @@ def _eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     finally:
         torch.set_num_threads(threads)
     return values, vectors
+
+
+def _damping(images: torch.Tensor, subset: int) -> torch.Tensor:
+    """Factors (3, P, 1), 1 but for pixels that stand far above all those of the subset.
+
+    At grazing views, or where one pixel of thousands mirrors the sun, unbounded lobes make a
+    pixel's images exceed the subset's a thousandfold. It would then fill the basis alone.
+    """
+    energy = (images**2).sum(dim=-1, keepdim=True)
+    usual = images.shape[-1] / subset  # the images are orthonormal on the subset
+    return (30.0 * usual / energy.clamp_min(1e-30)).sqrt().clamp_max(1.0)
 
 
 def _orthonormal(images: torch.Tensor) -> torch.Tensor:
