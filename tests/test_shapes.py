@@ -651,3 +651,12 @@ def test_a_folder_is_no_mesh_file(tmp_path: Path) -> None:
     (tmp_path / "a.obj").mkdir()
     with pytest.raises(FormatError, match="got a folder"):
         load_mesh(tmp_path / "a.obj")
+
+
+def test_a_dropped_triangle_does_not_count_for_the_size():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9], [10, 10, 10], [11, 11, 11]]
+    normals = np.tile([0.0, 0.0, 1.0], (6, 1))
+    made = Mesh(vertices, [[0, 1, 2], [3, 4, 5]], normals, [0, 0], ("a",))
+    again = Mesh(made.vertices, made.faces, made.normals, made.face_part, made.parts)
+    assert made.radius == again.radius == pytest.approx(0.5**0.5)
+    np.testing.assert_array_equal(made.center, again.center)

@@ -290,16 +290,8 @@ class Mesh:
         p = np.array(face_part)
         self.parts = tuple(parts)
         _check_mesh(v, f, n, p, self.parts)
-        used = v[np.unique(f)]  # a stray vertex must not blow up the bounding sphere
-        low, high = used.min(axis=0), used.max(axis=0)
-        self.center: Float = 0.5 * low + 0.5 * high
-        with np.errstate(over="ignore"):  # an infinite size is refused next
-            offset = used - self.center
-            self.radius = float(np.sqrt(_dot(offset, offset).max()))
-        if not (math.isfinite(self.radius) and self.radius > 0.0):
-            raise ValueError(f"vertices: expected a finite size above 0, got {self.radius}")
-        self._local = (v - self.center) / self.radius
-        corner = self._local[f]
+        center, radius = _bounds(v[np.unique(f)])
+        corner = ((v - center) / radius)[f]
         across, up = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
         side = corner[:, 2] - corner[:, 1]
         area = np.cross(across, up)
@@ -307,6 +299,11 @@ class Mesh:
         keep = np.sqrt(_dot(area, area)) > 1e-12 * longest
         if not keep.any():
             raise ValueError(f"faces: expected triangles with an area, got {len(f)} without")
+        # stray vertices and triangles that were dropped must not blow up the bounding sphere
+        self.center: Float
+        self.radius: float
+        self.center, self.radius = _bounds(v[np.unique(f[keep])])
+        self._local = (v - self.center) / self.radius
         self.vertices: Float = v
         self.faces: Int = f[keep].astype(np.int32)
         self.normals: Float = _unit(n if n.ndim == 2 else n[keep])
@@ -412,6 +409,18 @@ class Mesh:
         scene = embreex.rtcore_scene.EmbreeScene(robust=True)
         embreex.mesh_construction.TriangleMesh(scene, self._local.astype(np.float32), self.faces)
         return scene
+
+
+def _bounds(points: Float) -> tuple[Float, float]:
+    """Centre (3,) of the bounding box of points (n, 3), and the radius about it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    center: Float = 0.5 * low + 0.5 * high
+    with np.errstate(over="ignore"):  # an infinite size is refused next
+        offset = points - center
+        radius = float(np.sqrt(_dot(offset, offset).max()))
+    if not (math.isfinite(radius) and radius > 0.0):
+        raise ValueError(f"vertices: expected a finite size above 0, got {radius}")
+    return center, radius
 
 
 def _check_mesh(
