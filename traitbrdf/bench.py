@@ -12,7 +12,7 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf import models, reference
-from traitbrdf.brdf import TabulatedBRDF
+from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.directions import to_local
 from traitbrdf.editing import QUALITIES, EditSession
 from traitbrdf.embedding import Library, default_library
@@ -118,16 +118,16 @@ def unseen(data: Path | None, seed: int = 0) -> dict[str, list[TabulatedBRDF]]:
 
 
 def _reference_job(job: tuple[Any, ...]) -> tuple[Float64, Float64]:
-    normals, views, tables, environment, tolerance = job
-    return reference.radiance(normals, views, tables, environment, tolerance=tolerance)
+    normals, views, brdfs, environment, tolerance = job
+    return reference.radiance(normals, views, brdfs, environment, tolerance=tolerance)
 
 
 def reference_values(
-    scene: Scene, index: NDArray[np.int64], tables: list[TabulatedBRDF], tolerance: float
+    scene: Scene, index: NDArray[np.int64], brdfs: Sequence[Reflectance], tolerance: float
 ) -> tuple[Float64, Float64]:
-    """The oracle at pixels `index` (m,) for B tables: (m, B, 3) and its own error; all cores."""
+    """The oracle at pixels `index` (m,) for B BRDFs: (m, B, 3) and its own error; all cores."""
     jobs = [
-        (scene.normals[part], scene.views[part], tables, scene.environment, tolerance)
+        (scene.normals[part], scene.views[part], brdfs, scene.environment, tolerance)
         for part in np.array_split(index, max(len(index) // 8, 1))
     ]
     cores = os.cpu_count() or 1
@@ -239,7 +239,7 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     name, environment = maps(data, True)[0]
     scene = Scene(teapot(), environment, camera=BENCH_CAMERA, size=size)
     index = np.sort(np.random.default_rng(2).choice(len(scene.pixels), count, replace=False))
-    true, _ = _both(scene, index, closed)
+    true, _ = reference_values(scene, index, closed, 1e-3)
     tables = [TabulatedBRDF.from_model(m, grid) for m in closed]
     shown, _ = reference_values(scene, index, tables, 1e-3)
     error = [reference.relative_error(shown[:, i], true[:, i]) for i in range(len(closed))]
@@ -248,12 +248,6 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     how = f"{len(closed)} closed forms and measured BRDFs, grid {grid.shape}, map {name}"
     yield Record("table error, median", 100.0 * float(np.median(error)), "%", how=how)
     yield Record("table error, maximum", 100.0 * float(np.max(error)), "%", how=how)
-
-
-def _both(scene: Scene, index: NDArray[np.int64], brdfs: list[Any]) -> tuple[Float64, Float64]:
-    return reference.radiance(
-        scene.normals[index], scene.views[index], brdfs, scene.environment, tolerance=1e-3
-    )
 
 
 BENCH_CAMERA = Camera.orbit(-55.0, 30.0, zoom=1.5)
