@@ -408,3 +408,14 @@ def test_bad_offsets():
 def test_bad_samples(angles, rgb, match):
     with pytest.raises(ValueError, match=match):
         EMBEDDING.encode_samples(*angles, rgb)
+
+
+def test_energy_scale_says_how_much_decode_lowers():
+    rubber = LIBRARY.coordinates[LIBRARY.index("red-rubber")]
+    assert EMBEDDING.energy_scale(rubber) == 1.0
+    bright = EMBEDDING.high_
+    scale = EMBEDDING.energy_scale(bright)
+    assert 0.0 < scale < 1.0
+    raw, albedo = EMBEDDING._decode(bright, None)
+    assert scale == pytest.approx(1.0 / albedo)
+    np.testing.assert_allclose(EMBEDDING.decode_values(bright), raw * scale, rtol=1e-5)

@@ -166,6 +166,11 @@ class EditSession:
         values = material.values(self.embedding).reshape(*grid.shape, 3)
         return TabulatedBRDF(grid, values, material.mirror, material.name or part)
 
+    def _energy_scale(self, material: Material) -> float:
+        if material.table is not None:  # shown as it came
+            return 1.0
+        return self.embedding.energy_scale(material.z, material.offset)
+
     def _from_library(self, name: str) -> Material:
         z = self.library.coordinates[self.library.index(name)]
         return Material(self.embedding.clip(z), np.zeros(3), name=name)
@@ -379,7 +384,9 @@ class EditSession:
 
         ``frame_error`` is the mean relative L1 on the probe pixels, which keep their exact
         rows, over the whole object; ``parts`` has it part by part, with the tier ("basis" or
-        "exact"), the trait scores, the largest directional albedo and how far the coordinates
+        "exact"), the trait scores of its coordinates, ``energy_scale`` (the factor by which the
+        table had to be lowered to reflect no more than all light: below 1 it shows less of its
+        traits than the scores say), the largest directional albedo and how far the coordinates
         lie inside the gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts).
         """
         if self._transport is None or len(self._frames) < len(self.scene.parts):
@@ -397,6 +404,7 @@ class EditSession:
                 "error": frame.error,
                 "tier": self._frames[part][2],
                 "scores": self.traits.score(material.z),
+                "energy_scale": self._energy_scale(material),
                 "max_albedo": self.brdf(part).max_albedo(),
                 "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
             }

@@ -221,6 +221,21 @@ class BRDFEmbedding:
         16 check angles exceeds 1, all colours are divided by it. `offset` (cells, 3) is added to
         log(f + FLOOR): what a given table has beyond the manifold.
         """
+        values, albedo = self._decode(z, offset)
+        if albedo > 1.0:
+            values /= np.float32(albedo * (1.0 + 1e-6))
+        return values
+
+    def energy_scale(self, z: ArrayLike, offset: Float32 | None = None) -> float:
+        """The factor in (0, 1] by which `decode_values` lowers f to keep the albedo within 1.
+
+        1 where nothing is lowered. Below that the shown material is darker than its coordinates
+        say, and its traits are less pronounced than their scores.
+        """
+        return min(1.0, 1.0 / max(self._decode(z, offset)[1], 1e-30))
+
+    def _decode(self, z: ArrayLike, offset: Float32 | None) -> tuple[Float32, float]:
+        """f (cells, 3) before its energy is checked, and its greatest directional albedo."""
         scores = (_OPPONENT.T @ self.clip(z).reshape(3, -1)).T.astype(np.float32)
         logs: Float32 = self.components_ @ scores
         logs += self.mean_[:, None]
@@ -232,10 +247,7 @@ class BRDFEmbedding:
         np.exp(np.minimum(logs, 30.0, out=logs), out=logs)
         logs -= np.float32(FLOOR)
         np.maximum(logs, 0.0, out=logs)
-        albedo = float((self._albedo @ logs).max())
-        if albedo > 1.0:
-            logs /= np.float32(albedo * (1.0 + 1e-6))
-        return logs
+        return logs, float((self._albedo @ logs).max())
 
     def residual(self, brdf: TabulatedBRDF) -> Float32:
         """(cells, 3) difference of log(f + FLOOR) between a table and its encoding.
