@@ -143,13 +143,12 @@ def _scene(given: argparse.Namespace) -> tb.Scene:
     return tb.Scene(shape, environment, camera=camera, size=given.size)
 
 
-def _write(path: Path, image: NDArray[np.float32], exposure: float | None = None) -> None:
+def _write(path: Path, image: NDArray[np.float32]) -> None:
+    """Write an image to a path that `_check_out` let pass."""
     if path.suffix.lower() == ".exr":
         write_exr(path, image)
-    elif path.suffix.lower() == ".png":
-        write_png(path, tone_map(image, exposure_of(image) if exposure is None else exposure))
     else:
-        raise ValueError(f"--out: expected a name that ends in .png or .exr, got {str(path)!r}")
+        write_png(path, tone_map(image, exposure_of(image)))
 
 
 def _check_out(path: Path) -> None:
@@ -212,9 +211,10 @@ def _demo(given: argparse.Namespace) -> int:
     if not inside.any():
         raise ValueError(f"the {part} is not in view: choose another --camera")
     points, radius = follow(inside)
+    stroke = tb.Stroke(points, trait="shiny", amount=DEMO_AMOUNT, radius=radius)
     clock = time.perf_counter()
     score = session.scores(part)["shiny"]
-    moved = session.paint(tb.Stroke(points, trait="shiny", amount=DEMO_AMOUNT, radius=radius))
+    moved = session.paint(stroke)
     risen = session.scores(part)["shiny"] - score
     clock = step("stroke", clock)
     after = session.render()
@@ -241,7 +241,6 @@ def _demo(given: argparse.Namespace) -> int:
     pictures = tone_map(before, exposure), tone_map(after, exposure)
     write_png(given.out / "before.png", pictures[0])
     write_png(given.out / "after.png", pictures[1])
-    stroke = tb.Stroke(points, trait="shiny", amount=DEMO_AMOUNT, radius=radius)
     drawn = _draw_stroke(pictures[0], stroke)
     write_png(given.out / "side_by_side.png", np.concatenate([drawn, pictures[1]], axis=1))
     write_exr(given.out / "after.exr", after)
