@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: venv demo test lint types unit notebooks bench library clean
+.PHONY: venv peers demo test lint types unit notebooks bench library clean
 
 venv: $(STAMP)
 
@@ -14,6 +14,10 @@ $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $(STAMP)
+
+# The path tracer that tests/test_peers.py compares with; it needs Debian's libllvm19 as well.
+peers: venv
+	$(BIN)/python -m pip install --quiet --editable ".[peers]"
 
 # Paint "shiny" on the teapot's handle: pictures and report.json go to out/demo.
 demo: venv

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,15 @@ def find_shared_data() -> Path:
             pytest.fail(reason)
         pytest.skip(reason)
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests neither read nor fill the user's cache; programs that they start inherit this."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRAITBRDF_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("TRAITBRDF_CACHE_BYTES", "0")
+        yield
 
 
 @pytest.fixture

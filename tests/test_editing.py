@@ -1,25 +1,36 @@
-"""EditSession: edits that do what they say, undo, strokes, design files, honest reports."""
+"""EditSession: edits that do what they say, undo, strokes, design files, honest reports; views,
+preparations behind, drafts, the cache, and what lies outside the basis."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import CancelledError
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import traitbrdf as tb
 from traitbrdf import editing
-from traitbrdf.editing import EditSession
+from traitbrdf.editing import EditSession, Material
 from traitbrdf.formats import FormatError, read_arrays, write_arrays
 from traitbrdf.models import GGX, Lambert, PerfectMirror
 from traitbrdf.strokes import Stroke, follow
 from traitbrdf.traits import default_traits
+from traitbrdf.transport import Training, Transport
 
 TRAITS = default_traits().names
 EMBEDDING = tb.default_embedding()
+LIBRARY = tb.default_library()
 
 
 @pytest.fixture(autouse=True)
@@ -34,16 +45,32 @@ def prepared(small_teapot, training):
         return EditSession(small_teapot, quality="preview").prepare()
 
 
+@pytest.fixture(scope="module")
+def prepared_ball(training):
+    """A ball on the ground, in few pixels: the transport that sessions over its scene start with."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(editing, "_training", lambda library, seed: training)
+        return EditSession(ball_scene(), quality="preview").prepare()
+
+
+def ball_scene(size=20, **arguments):
+    settings = {"camera": tb.Camera.orbit(20.0, 25.0), "ground": True, **arguments}
+    return tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=size, **settings)
+
+
+def over(transport, **arguments):
+    """A new session over a prepared scene; what it trains is its own."""
+    session = EditSession(transport.scene, quality="preview", **arguments)
+    again = Transport.restored(transport.scene, transport.grid, transport.arrays())
+    again._operator = transport._operator  # the rays are cast once
+    session._view.transport = again
+    return session
+
+
 @pytest.fixture
-def fresh(small_teapot, prepared):
-    """Makes new sessions over one prepared scene."""
-
-    def make(**arguments):
-        session = EditSession(small_teapot, quality="preview", **arguments)
-        session._transport = prepared
-        return session
-
-    return make
+def fresh(prepared):
+    """Makes new sessions over one prepared scene; they do without exact frames unless asked."""
+    return lambda **arguments: over(prepared, **{"error": 1.0, **arguments})
 
 
 @pytest.fixture
@@ -61,6 +88,13 @@ def same(first, second):
     np.testing.assert_array_equal(first, second)
 
 
+def inside(scene, part):
+    """Mask (H, W) of the pixels that show a part, be it in a corner."""
+    mask = np.zeros(scene.height * scene.width, bool)
+    mask[scene.pixels[scene.part_slice(scene.parts.index(part))]] = True
+    return mask.reshape(scene.height, scene.width)
+
+
 # -- materials --------------------------------------------------------------------------------
 
 
@@ -72,9 +106,21 @@ def test_every_part_starts_with_a_material(edit):
     assert image.min() >= 0.0
     assert {edit.material(part).name for part in edit.scene.parts} == {"white-plastic"}
     assert edit.history == []
-    outside = edit.scene.part_image < 0
+    outside = edit.scene.uncovered.reshape(48, 60) == 1.0
     same(image[outside], edit.scene.backdrop()[outside])
     assert "0 edits" in repr(edit)
+
+
+def test_the_ground_starts_plain(prepared_ball):
+    session = over(prepared_ball)
+    assert session.scene.parts == ("sphere", "ground")
+    assert session.material("ground").name == "concrete"
+    assert session.material("sphere").name == "white-plastic"
+    albedo = session.brdf("ground").albedo(np.radians([30.0]))[0]
+    assert 0.1 < albedo.min() and albedo.max() < 0.5 and np.ptp(albedo) < 0.1 * albedo.max()
+    session.assign("ground", "blue-plastic")
+    assert session.undo()
+    assert session.material("ground").name == "concrete"
 
 
 def test_assigning_changes_one_part_or_several(edit):
@@ -82,8 +128,8 @@ def test_assigning_changes_one_part_or_several(edit):
     edit.assign("body", "blue-plastic")
     after = edit.render()
     changed = np.any(after != before, axis=-1)
-    body = edit.scene.part_image == edit.part("body")
-    assert changed[body].all()
+    body = inside(edit.scene, "body")
+    assert changed[body].mean() > 0.99
     assert not changed[~body].any()
     edit.assign(["lid", "spout"], "gold-polished")
     assert edit.material("lid") is edit.material("spout")
@@ -134,8 +180,11 @@ def test_a_perfect_mirror_shows_the_map(edit):
     image = edit.render().reshape(-1, 3)
     where = edit.scene.part_slice(edit.part("body"))
     seen = edit.prepare().parts[edit.part("body")].mirror.numpy()
-    np.testing.assert_allclose(image[edit.scene.pixels[where]], seen * [0.5, 0.25, 1.0], rtol=1e-3,
-                               atol=1e-3)  # fmt: skip
+    alone = edit.scene.weights[where] == 1.0
+    np.testing.assert_allclose(
+        image[edit.scene.pixels[where][alone]], (seen * [0.5, 0.25, 1.0])[alone], rtol=1e-3,
+        atol=1e-3,
+    )  # fmt: skip
     same(edit.brdf("body").mirror, [0.5, 0.25, 1.0])
 
 
@@ -257,7 +306,7 @@ def test_an_amount_of_zero_changes_no_pixel(edit, trait):
     edit.move("body", **{trait: 0.0})
     edit.paint(on(edit.scene, "body", 0.0, trait))
     assert edit.material("body") is material
-    edit._frames.clear()  # also when computed anew
+    edit._view.kept.clear()  # also when computed anew
     same(edit.render(), before)
 
 
@@ -269,11 +318,11 @@ def test_painting_a_part_changes_no_pixel_outside_and_does_what_it_says(edit):
     before, score = edit.render(), edit.scores("handle")
     moved = edit.paint(on(edit.scene, "handle", 0.6))
     assert moved == {"handle": 0.6}
-    edit._frames.clear()
+    edit._view.kept.clear()
     after = edit.render()
-    handle = edit.scene.part_image == edit.part("handle")
+    handle = inside(edit.scene, "handle")
     same(after[~handle], before[~handle])
-    assert np.any(after[handle] != before[handle], axis=-1).all()
+    assert np.any(after[handle] != before[handle], axis=-1).mean() > 0.99
     assert edit.scores("handle")["shiny"] - score["shiny"] >= 0.9 * 0.6
     for colour in ("red", "green", "blue"):  # held unless it is painted
         assert edit.scores("handle")[colour] == pytest.approx(score[colour], abs=1e-6)
@@ -455,7 +504,7 @@ def replaced(**values):
 @pytest.mark.parametrize(
     "change",
     [
-        change_header(format=2),
+        change_header(format=3),
         change_header(format=None),
         change_header(embedding="0123456789abcdef"),
         change_header(shape={"kind": "mesh", "parts": ["one"]}),
@@ -551,65 +600,17 @@ def test_the_report_is_plain_finite_json(edit):
     again = json.loads(json.dumps(report, allow_nan=False))
     assert again == report
     assert all(math.isfinite(n) for n in numbers(report))
-    assert report["covered_pixels"] == len(edit.scene.pixels)
+    assert report["covered_pixels"] == np.count_nonzero(edit.scene.uncovered < 1.0)
+    assert report["fragments"] == len(edit.scene.pixels)
     assert set(report["parts"]) == set(edit.scene.parts)
     assert sum(part["pixels"] for part in report["parts"].values()) == len(edit.scene.pixels)
     assert report["frame_error"] < 0.05
+    assert report["error_asked"] == 1.0
     assert report["history"] == edit.history
     for part, entry in report["parts"].items():
-        assert entry["tier"] in ("basis", "exact")
+        assert entry["tier"] == "basis"
         assert entry["scores"] == edit.scores(part)
         assert 0.0 <= entry["max_albedo"] <= 1.0 + 1e-3
         assert 0.0 <= entry["gamut_margin"] <= 0.5
     edit.assign("body", "red-rubber")  # no frame in between
     assert edit.report()["parts"]["body"]["material"] == "red-rubber"
-
-
-def test_a_part_beyond_its_error_is_rendered_exactly(fresh):
-    asked = fresh(error=1e-9)
-    asked.assign("body", "chrome")
-    image = asked.render().reshape(-1, 3)
-    report = asked.report()
-    for i, part in enumerate(asked.scene.parts):
-        assert report["parts"][part]["tier"] == "exact"
-        assert report["parts"][part]["error"] == 0.0
-        values = asked.brdf(part).values.reshape(-1, 3)
-        true = asked.prepare().shade_exactly(i, values).radiance
-        same(image[asked.scene.pixels[asked.scene.part_slice(i)]], true.numpy())
-    assert report["frame_error"] == 0.0
-
-
-def test_the_default_limit_is_an_error_of_five_percent(fresh, monkeypatch):
-    noise = np.exp(2.0 * np.random.default_rng(0).normal(size=(*EMBEDDING.grid_.shape, 3)))
-    wild = tb.TabulatedBRDF(EMBEDDING.grid_, noise.astype(np.float32))
-    edit = fresh()
-    edit.assign("body", wild)
-    edit.assign("lid", "green-felt")
-    edit.render()
-    assert edit.report()["parts"]["body"]["tier"] == "exact"
-    assert edit.report()["parts"]["lid"]["tier"] == "basis"
-    monkeypatch.setattr(editing, "EXACT_ABOVE", 1e-9)
-    edit._frames.clear()
-    assert edit.report()["parts"]["lid"]["tier"] == "exact"
-
-
-def test_preparing_tells_and_can_be_cancelled():
-    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=32), size=16)
-    told = []
-    session = EditSession(scene, "preview", progress=lambda *news: told.append(news))
-    assert not told  # nothing is prepared before it is needed
-    transport = session.prepare()
-    assert told[-1][1] == 1.0
-    assert session.prepare() is transport
-
-    class CancelError(Exception):
-        pass
-
-    def cancel(stage, fraction):
-        raise CancelError
-
-    session = EditSession(scene, "preview", progress=cancel)
-    with pytest.raises(CancelError):
-        session.render()
-    session._progress = None
-    same(session.render(), session.render())

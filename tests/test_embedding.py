@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_operator
 from traitbrdf.embedding import (
     FLOOR,
     GRID,
@@ -57,7 +58,47 @@ def channels(z):
             achromatic / 3**0.5 - red_blue / 2**0.5 - green / 6**0.5,
         ],
         axis=1,
-    ).astype(np.float32)
+    )
+
+
+def exact(z, offset=None, cells=slice(None)):
+    """What `decode_values` promises, in float64 and independent of its code."""
+    logs = EMBEDDING.components_.astype(np.float64) @ channels(EMBEDDING.clip(z))
+    logs += EMBEDDING.mean_[:, None]
+    logs += 0.0 if offset is None else offset
+    values = np.maximum(np.exp(np.minimum(logs, 30.0)) - FLOOR, 0.0)
+    albedo = (albedo_operator(GRID, ALBEDO_ANGLES) @ values).max()
+    return values[cells] / (albedo * (1.0 + 1e-6) if albedo > 1.0 else 1.0)
+
+
+def differences(z, offset, cells, axes, step=1e-5):
+    """Central differences (n, 3, axes) of `exact`."""
+    columns = []
+    for axis in axes:
+        ends = np.array(z) + step * np.outer([-1.0, 1.0], np.arange(len(z)) == axis)
+        low, high = (exact(end, offset, cells) for end in ends)
+        columns.append((high - low) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def away(slopes, reference):
+    """Difference of two (n, 3, k) relative to the largest slope of the cell and colour."""
+    return np.abs(slopes - reference) / np.abs(reference).max(axis=-1, keepdims=True).clip(1e-12)
+
+
+def some_cells(seed, count):
+    return np.random.default_rng(seed).integers(0, GRID.size, count)
+
+
+def some_offset(seed, size=0.3):
+    return (size * np.random.default_rng(seed).normal(size=(GRID.size, 3))).astype(np.float32)
+
+
+DIM = CENTRE + np.repeat([-0.2, 0.0, 0.1], EMBEDDING.n_components) * SPAN
+BRIGHT = CENTRE + np.repeat([0.48, 0.1, 0.05], EMBEDDING.n_components) * SPAN
+SCALED = EMBEDDING.clip(min(LIBRARY.coordinates, key=EMBEDDING.energy_scale))
+points = pytest.mark.parametrize("z", [DIM, SCALED, BRIGHT], ids=["dim", "scaled", "bright"])
+offsets = pytest.mark.parametrize("offset", [None, some_offset(1)], ids=["alone", "offset"])
 
 
 def small_embedding(grid=None, components=2):
@@ -203,6 +244,214 @@ def test_decoded_tables_are_reciprocal(seed):
 def test_the_library_is_passive():
     for z in LIBRARY.coordinates[::10]:
         assert EMBEDDING.decode(z).max_albedo() <= 1.0 + 1e-3
+
+
+# -- some cells, slopes and tensors -----------------------------------------------------------
+
+
+def test_the_points_are_with_and_without_scaling():
+    for offset in (None, some_offset(1)):
+        assert EMBEDDING.energy_scale(DIM, offset) == 1.0
+        assert 0.5 < EMBEDDING.energy_scale(SCALED, offset) < 0.9
+        assert EMBEDDING.energy_scale(BRIGHT, offset) < 0.1
+
+
+@points
+@offsets
+def test_decoding_is_what_it_says(z, offset):
+    values = exact(z, offset)
+    np.testing.assert_allclose(EMBEDDING.decode_values(z, offset), values, rtol=2e-5, atol=1e-8)
+
+
+@few
+@given(seeds, st.sampled_from([0.5, 1.0, 3.0]), st.booleans(), st.integers(0, 300))
+def test_some_cells_are_cells_of_the_table(seed, spread, with_offset, count):
+    """In any order, repeated ones and none too.
+
+    Where they are scaled, the sparse float32 sums of the whole table err by 1e-5.
+    """
+    z, cells = in_the_box(seed, spread), some_cells(seed, count)
+    offset = some_offset(seed) if with_offset else None
+    values = EMBEDDING.decode_values(z, offset, cells)
+    assert values.dtype == np.float32
+    assert values.shape == (count, 3)
+    whole = EMBEDDING.decode_values(z, offset)
+    np.testing.assert_allclose(values, whole[cells], rtol=4e-5, atol=1e-8)
+    tensor = EMBEDDING.decode_tensor(torch.tensor(z), offset, cells)
+    assert tensor.dtype == torch.float64
+    np.testing.assert_allclose(tensor.numpy(), values, rtol=2e-5, atol=1e-8)
+
+
+@points
+@offsets
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_tensors_decode_alike(z, offset, dtype):
+    tensor = EMBEDDING.decode_tensor(torch.tensor(z, dtype=dtype), offset)
+    assert tensor.dtype == dtype
+    whole = EMBEDDING.decode_values(z, offset)
+    np.testing.assert_allclose(tensor.numpy(), whole, rtol=3e-5, atol=2e-8)
+
+
+@points
+@offsets
+@pytest.mark.parametrize("cells", [None, some_cells(2, 500)], ids=["all", "some"])
+def test_slopes_are_those_of_differences(z, offset, cells):
+    """On all cells along three coordinates, one of each colour axis; on some along each."""
+    axes = np.arange(EMBEDDING.size) if cells is not None else np.array([1, 8, 18])
+    slopes = EMBEDDING.jacobian(z, offset, cells)
+    assert slopes.dtype == np.float32
+    index = np.arange(GRID.size) if cells is None else cells
+    assert slopes.shape == (len(index), 3, EMBEDDING.size)
+    values = exact(z, offset, index)
+    expected = differences(z, offset, index, axes)
+    # what is within a step of black has a difference across the kink
+    smooth = np.where(values == 0.0, ~expected.any(axis=-1), values > 1e-6)
+    assert smooth.mean() > 0.99
+    # a column alone may be the difference of two large numbers: compare to the largest slope
+    scale = np.abs(slopes).max(axis=-1)[smooth].clip(1e-12)
+    error = np.abs(slopes[..., axes] - expected)[smooth]
+    assert (error / scale[:, None]).max() < 2e-4
+    assert not slopes[values == 0.0].any()
+
+
+@points
+@offsets
+def test_slopes_are_those_of_autograd(z, offset):
+    cells = some_cells(3, 12)
+    by_torch = torch.autograd.functional.jacobian(
+        lambda point: EMBEDDING.decode_tensor(point, offset, cells), torch.tensor(z)
+    )
+    assert away(EMBEDDING.jacobian(z, offset, cells), by_torch.numpy()).max() < 2e-5
+
+
+@few
+@given(seeds, st.sampled_from([0.5, 1.0, 2.0]), st.booleans())
+def test_gradients_are_products_with_the_slopes(seed, spread, with_offset):
+    """The chain rule, at points inside and outside of the box."""
+    z, cells = in_the_box(seed, spread), some_cells(seed, 200)
+    offset = some_offset(seed) if with_offset else None
+    point = torch.tensor(z, requires_grad=True)
+    back = np.random.default_rng(seed).normal(size=(200, 3))
+    EMBEDDING.decode_tensor(point, offset, cells).backward(torch.tensor(back))
+    slopes = EMBEDDING.jacobian(z, offset, cells)
+    terms = np.abs(back[..., None] * slopes).sum(axis=(0, 1))
+    error = np.abs(point.grad.numpy() - np.einsum("nc,nck->k", back, slopes))
+    assert np.all(error <= 2e-5 * terms.max())
+    outside = z != EMBEDDING.clip(z)
+    assert not point.grad.numpy()[outside].any()
+    assert not slopes[..., outside].any()
+
+
+@few
+@given(seeds)
+def test_scaled_tables_keep_their_greatest_albedo(seed):
+    """Along every coordinate: the albedo that is held at 1 has slope 0."""
+    z = EMBEDDING.clip(BRIGHT + 0.05 * np.random.default_rng(seed).uniform(-1.0, 1.0, 24) * SPAN)
+    rows = albedo_operator(GRID, ALBEDO_ANGLES)
+    slopes = EMBEDDING.jacobian(z).reshape(GRID.size, -1)
+    change = np.abs(rows @ slopes).reshape(-1, EMBEDDING.size)  # angles and colours
+    held = (rows @ EMBEDDING.decode_values(z)).ravel().argmax()
+    assert change[held].max() < 1e-4 * change.max()
+
+
+def test_a_scaled_grey_favours_no_colour():
+    """Three albedos are the greatest at once: the slope is the mean of theirs."""
+    z, cells = EMBEDDING.clip(np.where(np.arange(EMBEDDING.size) < 8, BRIGHT, 0.0)), [5, 700, 9000]
+    assert not z[8:].any()
+    assert EMBEDDING.energy_scale(z) < 0.9
+    slopes = EMBEDDING.jacobian(z, cells=cells)
+    np.testing.assert_allclose(slopes[:, 0, :8], slopes[:, 1, :8], rtol=1e-5)
+    np.testing.assert_allclose(slopes[:, 0, 8:16], -slopes[:, 2, 8:16], rtol=1e-4, atol=1e-5)
+    assert np.abs(slopes[:, 1, 8:16]).max() < 1e-5 * np.abs(slopes).max()
+    np.testing.assert_allclose(slopes[..., 16:].sum(axis=1), 0.0, atol=1e-5 * np.abs(slopes).max())
+    for dtype in (torch.float32, torch.float64):
+        by_torch = torch.autograd.functional.jacobian(
+            lambda point: EMBEDDING.decode_tensor(point, cells=cells), torch.tensor(z, dtype=dtype)
+        )
+        assert away(slopes, by_torch.numpy()).max() < 1e-4
+    # the differences see the mean too where the greatest albedo is even in the coordinate
+    axes = np.arange(16)
+    assert away(slopes[..., :16], differences(z, None, cells, axes)).max() < 1e-3
+
+
+def test_slopes_at_the_kinks():
+    cells = some_cells(4, 50)
+    for size in (-50.0, 1e4):  # all black; all at the cap
+        still = np.full((GRID.size, 3), size, np.float32)
+        assert not EMBEDDING.jacobian(DIM, still, cells).any()
+        point = torch.tensor(DIM, requires_grad=True)
+        EMBEDDING.decode_tensor(point, still, cells).sum().backward()
+        assert not point.grad.any()
+    for face, outwards in ((EMBEDDING.low_, -1.0), (EMBEDDING.high_, 1.0)):
+        z = np.where(np.arange(EMBEDDING.size) == 2, face, DIM)
+        on_it = EMBEDDING.jacobian(z, cells=cells)
+        inside = EMBEDDING.jacobian(np.where(z == face, z - 1e-6 * outwards, z), cells=cells)
+        beyond = EMBEDDING.jacobian(np.where(z == face, z + 1e-6 * outwards, z), cells=cells)
+        assert np.abs(on_it[..., 2]).max() > 0.0
+        assert away(inside, on_it).max() < 1e-4
+        assert not beyond[..., 2].any()
+        by_torch = torch.autograd.functional.jacobian(
+            lambda point: EMBEDDING.decode_tensor(point, cells=cells[:5]), torch.tensor(z)
+        )
+        assert away(on_it[:5], by_torch.numpy()).max() < 1e-4
+
+
+def test_gradients_of_an_offset_and_of_another_embedding():
+    embedding = small_embedding()
+    middle = torch.tensor(0.5 * (embedding.low_ + embedding.high_), requires_grad=True)
+    offset = torch.full((embedding.grid_.size, 3), 0.1, dtype=torch.float64)
+    for brighter in (0.0, 3.0):
+        whole = (offset + brighter).requires_grad_()
+        scaled = embedding.energy_scale(middle.detach(), whole.detach().numpy()) < 1.0
+        assert scaled == (brighter > 0.0)
+        assert torch.autograd.gradcheck(
+            lambda z, o: embedding.decode_tensor(z, o, [3, 200, 411]),
+            (middle, whole),
+            fast_mode=True,
+        )
+
+
+def test_kept_tensors():
+    """They can be differentiated through whatever made them, and do not outlive a fit."""
+    embedding = small_embedding()
+    z = 0.5 * (embedding.low_ + embedding.high_)
+    with torch.inference_mode():
+        embedding.decode_tensor(torch.tensor(z))
+    point = torch.tensor(z, requires_grad=True)
+    embedding.decode_tensor(point).sum().backward()
+    assert point.grad.any()
+    grid = HalfDiffGrid(8, 4, 3)
+    models = [Lambert(0.3), GGX(0.5, 1.5, 0.0), BoundedPhong(0.6, 30.0)]
+    embedding.fit([TabulatedBRDF.from_model(m, grid) for m in models])
+    z = 0.5 * (embedding.low_ + embedding.high_)
+    again = embedding.decode_tensor(torch.tensor(z))
+    np.testing.assert_allclose(again.numpy(), embedding.decode_values(z), rtol=1e-5, atol=1e-8)
+
+
+def test_read_only_arrays():
+    """Torch warns of sharing them, and a warning fails."""
+    offset, cells = some_offset(5), np.arange(7, dtype=np.int64)
+    offset.flags.writeable = cells.flags.writeable = False
+    tensor = EMBEDDING.decode_tensor(torch.tensor(DIM), offset, cells)
+    values = EMBEDDING.decode_values(DIM, offset, cells)
+    np.testing.assert_allclose(tensor.numpy(), values, rtol=2e-5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@points
+@offsets
+def test_on_a_device(z, offset):
+    point = torch.tensor(z, dtype=torch.float32, device="cuda", requires_grad=True)
+    cells = some_cells(6, 300)
+    tensor = EMBEDDING.decode_tensor(point, offset, cells)
+    assert tensor.device == point.device
+    values = EMBEDDING.decode_values(z, offset, cells)
+    np.testing.assert_allclose(tensor.detach().cpu().numpy(), values, rtol=1e-4, atol=1e-7)
+    tensor.sum().backward()
+    slopes = EMBEDDING.jacobian(z, offset, cells)
+    terms = np.abs(slopes).sum(axis=(0, 1))
+    error = np.abs(point.grad.cpu().numpy() - slopes.sum(axis=(0, 1)))
+    assert np.all(error <= 1e-4 * terms.max())
 
 
 # -- scattered measurements -------------------------------------------------------------------
@@ -365,6 +614,9 @@ def test_an_unfitted_embedding_says_so():
         lambda: fresh.encode(Lambert(0.5)),
         lambda: fresh.decode(np.zeros(9)),
         lambda: fresh.decode_values(np.zeros(9)),
+        lambda: fresh.decode_values(np.zeros(9), cells=[0]),
+        lambda: fresh.jacobian(np.zeros(9)),
+        lambda: fresh.decode_tensor(torch.zeros(9)),
         lambda: fresh.encode_samples([0.1], [0.1], [0.1], [[1.0, 1.0, 1.0]]),
         lambda: fresh.residual(LIBRARY["gold-polished"]),
         fresh.arrays,
@@ -379,6 +631,23 @@ def test_bad_coordinates(z):
         EMBEDDING.decode(z)
     with pytest.raises(ValueError, match="z: expected"):
         EMBEDDING.clip(z)
+    with pytest.raises(ValueError, match="z: expected"):
+        EMBEDDING.jacobian(z)
+
+
+@pytest.mark.parametrize(
+    "z", [torch.zeros(23), torch.zeros((1, 24)), torch.zeros(24, dtype=torch.float16)]
+)
+def test_bad_tensors(z):
+    with pytest.raises(ValueError, match="z: expected"):
+        EMBEDDING.decode_tensor(z)
+
+
+@pytest.mark.parametrize("cells", [[-1], [3, GRID.size], [0.0], 5, [[1, 2]], [True]])
+def test_bad_cells(cells):
+    for call in (EMBEDDING.decode_values, EMBEDDING.jacobian, EMBEDDING.decode_tensor):
+        with pytest.raises(ValueError, match="cells: expected"):
+            call(torch.tensor(CENTRE), cells=cells)
 
 
 def test_what_cannot_be_encoded():
@@ -388,8 +657,9 @@ def test_what_cannot_be_encoded():
 
 
 def test_bad_offsets():
-    with pytest.raises(ValueError, match="offset"):
-        EMBEDDING.decode_values(CENTRE, np.zeros((5, 3), np.float32))
+    for call in (EMBEDDING.decode_values, EMBEDDING.jacobian, EMBEDDING.decode_tensor):
+        with pytest.raises(ValueError, match=r"offset: expected shape \(19440, 3\), got \(5, 3\)"):
+            call(torch.tensor(CENTRE), np.zeros((5, 3), np.float32))
 
 
 @pytest.mark.parametrize(

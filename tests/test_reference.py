@@ -22,6 +22,8 @@ from traitbrdf.models import (
     Sheen,
     TorranceSparrowSimplified,
 )
+from traitbrdf.scene import Camera, Scene
+from traitbrdf.shapes import Mesh, sphere
 
 # resolves the sharpest lobe here, width 0.002, where the nodes of a table do not
 FINE = np.unique(np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 60), np.linspace(0.05, 1.57, 60)]))
@@ -265,9 +267,10 @@ def test_texels_at_the_poles_are_not_lost_at_the_horizon(row):
 
 def refined(environment, normals, views, models, resolution=0.05):
     evaluate = reference._Evaluator(models)
+    texels = reference._Cells.texels(environment.image)
     return np.array(
         [
-            reference._integrate(environment, n, v, evaluate, resolution)
+            reference._integrate(texels, n, v, evaluate, resolution)
             for n, v in zip(normals, views, strict=True)
         ]
     )
@@ -330,40 +333,346 @@ def test_refuses_what_no_mesh_resolves(monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------------
+# shadows
+
+
+def over_the_ground(environment=None, lights=(), radius=1.0, **settings):
+    """A sphere that lies on the ground, seen from above."""
+    settings = {"size": 20, "camera": Camera.orbit(30.0, 25.0, zoom=0.6)} | settings
+    light = EnvironmentMap(np.zeros((2, 4, 3))) if environment is None else environment
+    return Scene(sphere(radius), light, lights, ground=True, **settings)
+
+
+def beside_a_wall(environment=None, scale=1.0, **settings):
+    """A floor of 6 x 4 at the foot of a wall 2 high, seen from the front."""
+    low, high = [[-3, 0, 0], [3, 0, 0], [3, 0, 4], [-3, 0, 4]], [[3, 2, 0], [-3, 2, 0]]
+    shape = Mesh(
+        scale * np.array([*low, *low[:2], *high], np.float64),
+        [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]],
+        [[0, 1, 0]] * 4 + [[0, 0, 1]] * 4,
+        [0, 0, 1, 1],
+        ("floor", "wall"),
+    )
+    settings = {"size": 20, "camera": Camera.orbit(0.0, 35.0, zoom=2.0)} | settings
+    return Scene(shape, environment, **settings)
+
+
+def inner_fragments(scene, part, count, seed=0):
+    """Random fragments of one part that fill their pixels, of one sample each."""
+    index = np.arange(len(scene.pixels))[scene.part_slice(scene.parts.index(part))]
+    index = index[~scene.bordering[index]]
+    return np.random.default_rng(seed).permutation(index)[:count]
+
+
+def sphere_hides(scene, toward, distance=np.inf):
+    """Whether the sphere stands before directions (n, 3) from all samples, and by what margin."""
+    offset = scene.positions - scene.shape.center
+    along = -np.sum(offset * toward, axis=-1)
+    nearest = np.linalg.norm(offset + along[:, None] * toward, axis=-1) / scene.shape.radius
+    return (nearest < 1.0) & (along > 0.0) & (along < distance), np.abs(nearest - 1.0)
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        DirectionalLight((1.0, 1.2, -0.3), (3.0, 2.0, 1.0)),
+        PointLight((2.0, 1.5, 0.5), (40.0, 20.0, 10.0)),
+    ],
+    ids=["directional", "point"],
+)
+def test_shadow_of_a_sphere_on_the_ground(light):
+    """Every sample, of the sphere too: the closed form, or nothing at all in the shadow."""
+    scene = over_the_ground(lights=[light], size=40)
+    if isinstance(light, PointLight):
+        offset = np.array(light.position) - scene.positions
+        distance = np.linalg.norm(offset, axis=-1)
+        toward = offset / distance[:, None]
+        across = np.array(light.intensity) / distance[:, None] ** 2
+    else:
+        distance = np.inf
+        toward = np.broadcast_to(light.direction, scene.positions.shape)
+        across = np.array(light.irradiance)
+    cos = cosine(scene.normals, toward)
+    hidden, margin = sphere_hides(scene, toward, distance)
+    ground = scene.normals[:, 1] == 1.0
+    expected = (
+        0.5 / math.pi * across * np.where(hidden & ground, 0.0, np.maximum(cos, 0.0))[:, None]
+    )
+    index = np.arange(len(scene.pixels))
+    sample, owner, share = scene.samples(index)
+    # on the very edge of the shadow it is for rounding to decide
+    sure = np.bincount(owner, (margin < 1e-4) & ground) == 0
+    assert np.mean(~sure) < 0.01
+    assert 30 < np.count_nonzero(hidden & ground) < 0.5 * np.count_nonzero(ground)
+    total = np.zeros((len(index), 3))
+    np.add.at(total, owner, share[:, None] * expected[sample])
+    values, error = reference.fragments(scene, index, [Lambert(0.5)])
+    np.testing.assert_allclose(values[sure, 0], total[sure], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(error, 0.0)
+
+
+def test_sky_hidden_by_a_sphere():
+    """Seen from a plane, a sphere above it has the form factor cos(theta) (R / d)^2."""
+    scene = over_the_ground(EnvironmentMap.uniform((1.0, 2.0, 3.0)))
+    index = inner_fragments(scene, "ground", 40)
+    values, _ = reference.fragments(scene, index, [Lambert(0.8)])
+    distance = np.linalg.norm(scene.positions[scene.offsets[index]] - scene.shape.center, axis=-1)
+    factor = 1.0 / distance**3  # cos(theta) = R / d: the sphere lies on the plane
+    assert factor.max() > 0.4
+    np.testing.assert_allclose(
+        values[:, 0], 0.8 * (1.0 - factor)[:, None] * (1.0, 2.0, 3.0), rtol=1e-3
+    )
+
+
+def test_sky_hidden_by_a_wall():
+    """The form factor of a rectangle that stands upright before the floor; at its foot 1/2."""
+    camera = Camera.orbit(0.0, 35.0, zoom=8.0, target=(0.0, 0.0, 0.3))
+    scene = beside_a_wall(EnvironmentMap.uniform(), camera=camera)
+    index = inner_fragments(scene, "floor", 40)
+    values, _ = reference.fragments(scene, index, [Lambert(0.8)])
+    x, _, z = scene.positions[scene.offsets[index]].T
+
+    def quarter(width):  # Howell's catalogue of view factors: element to perpendicular rectangle
+        slant = np.hypot(2.0, z)
+        near, far = np.arctan2(width, z), z / slant * np.arctan2(width, slant)
+        return (near - far) / (2.0 * math.pi)
+
+    factor = quarter(3.0 - x) + quarter(3.0 + x)
+    assert factor.max() > 0.45
+    np.testing.assert_allclose(values[:, 0, 0], 0.8 * (1.0 - factor), rtol=3e-3)
+
+
+def test_smaller_pieces_come_nearer():
+    scene = over_the_ground(EnvironmentMap.uniform())
+    index = inner_fragments(scene, "ground", 20)
+    distance = np.linalg.norm(scene.positions[scene.offsets[index]] - scene.shape.center, axis=-1)
+    deviation = [
+        np.sqrt(np.mean((values[:, 0, 0] / (1.0 - 1.0 / distance**3) - 1.0) ** 2))
+        for values, _ in (
+            reference.fragments(scene, index, [Lambert(1.0)], shadow_cell=cell)
+            for cell in (0.1, 0.025)
+        )
+    ]
+    assert deviation[1] < 0.3 * deviation[0]
+
+
+def test_a_sun_of_one_texel_casts_a_sharp_shadow():
+    """At 256 rows a texel is one piece: all of it is seen or nothing, as from its centroid."""
+    image = np.zeros((256, 512, 3))
+    image[60, 100] = 1000.0
+    environment = EnvironmentMap(image, 0.3)
+    scene = over_the_ground(environment)
+    # light from one place: its irradiance on planes along the axes tells where
+    moment = (environment.irradiance(np.eye(3)) - environment.irradiance(-np.eye(3)))[:, 0]
+    toward = moment / np.linalg.norm(moment)
+    hidden, margin = sphere_hides(scene, toward)
+    index = inner_fragments(scene, "ground", 400)
+    first = scene.offsets[index]
+    assert margin[first].min() > 1e-4
+    values, _ = reference.fragments(scene, index, [Lambert(1.0)])
+    dark = hidden[first]
+    assert 5 < np.count_nonzero(dark) < 0.5 * len(dark)
+    np.testing.assert_array_equal(values[dark], 0.0)
+    lit = environment.irradiance(np.array([0.0, 1.0, 0.0])) / math.pi
+    np.testing.assert_allclose(values[~dark, 0], np.broadcast_to(lit, (sum(~dark), 3)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_hidden_texels_are_as_good_as_black(angle):
+    """All pieces of half the map are hidden: the same as a map that is black there."""
+    environment = random_map().rotated(angle)
+    image = environment.image.copy()
+    image[:, :8] = 0.0  # from +z over -x to -z
+    normals, views = points(3)
+    models = [GGX(alpha=0.1), Lambert(0.5), PerfectMirror(0.5)]
+
+    def visible(point, w):
+        assert point.shape == w.shape[:1]
+        return turn_about_y(w, -angle)[:, 0] > 0.0
+
+    shaded, error = reference.radiance(normals, views, models, environment, visible=visible)
+    black, _ = reference.radiance(normals, views, models, EnvironmentMap(image, angle))
+    np.testing.assert_allclose(shaded, black, rtol=1e-6)
+    assert np.all(error.max(-1) <= 1e-4 * shaded.max(-1))
+
+
+def test_nothing_hidden_is_no_shadow():
+    environment, models = random_map(), [GGX(alpha=0.1) + PerfectMirror(0.3), Lambert(0.5)]
+    normals, views = points(3)
+    free, _ = reference.radiance(normals, views, models, environment)
+    seen, _ = reference.radiance(
+        normals, views, models, environment, visible=lambda point, w: np.ones(len(w), bool)
+    )
+    np.testing.assert_allclose(seen, free, rtol=1e-6)
+    dark, error = reference.radiance(
+        normals, views, models, environment, visible=lambda point, w: np.zeros(len(w), bool)
+    )
+    np.testing.assert_array_equal(dark, 0.0)
+    np.testing.assert_array_equal(error, 0.0)
+
+
+def test_rays_go_only_where_light_may_come_from():
+    image = np.zeros((8, 16, 3))
+    image[:3, 4:9] = 1.0
+    normals, views = points(2)
+    asked = []
+
+    def visible(point, w):
+        asked.append((point, w))
+        return np.ones(len(w), bool)
+
+    environment = EnvironmentMap(image, 0.4)
+    reference.radiance(normals, views, [Lambert(1.0)], environment, visible=visible)
+    point, w = (np.concatenate(both) for both in zip(*asked, strict=True))
+    assert np.all(environment.radiance(w) > 0.0)
+    assert np.all(cosine(normals[point], w) > -0.02)
+    above = cosine(normals, np.broadcast_to([0.0, 1.0, 0.0], (2, 3))) > 0.0
+    assert set(point[above[point]]) == set(np.flatnonzero(above))
+    # pieces of pi / 8 / 32: 3 x 5 texels of 32 x 32 at most for each point
+    assert len(w) <= 2 * 15 * 32**2
+
+
+def test_a_mirror_shows_the_wall_black():
+    """One ray in the mirror direction tells whether the map is seen in the floor."""
+    environment = random_map(seed=5)
+    scene = beside_a_wall(environment, subsamples=1)
+    index = inner_fragments(scene, "floor", 50)
+    values, _ = reference.fragments(scene, index, [PerfectMirror(1.0)])
+    first = scene.offsets[index]
+    x, _, z = scene.positions[first].T
+    toward = reflect(scene.views, scene.normals)[first]
+    with np.errstate(divide="ignore"):
+        away = np.where(toward[:, 2] < 0.0, -z / toward[:, 2], np.inf)
+    meets = (away * toward[:, 1] < 2.0) & (np.abs(x + away * toward[:, 0]) < 3.0)
+    assert 5 < np.count_nonzero(meets) < 45
+    shown = np.where(meets[:, None], 0.0, environment.radiance(toward))
+    np.testing.assert_allclose(values[:, 0], shown, rtol=1e-6)
+
+
+def test_shadowed_radiance_is_linear_in_the_light():
+    first, second = random_map(seed=1), random_map(seed=2)
+    mixed = EnvironmentMap(2.0 * first.image.astype(float) + 0.5 * second.image.astype(float))
+    lamp = PointLight((1.0, 3.0, 2.0), (4.0, 5.0, 6.0))
+    double = PointLight(lamp.position, (8.0, 10.0, 12.0))
+    models = [GGX(alpha=0.1), Lambert(0.5)]
+    scene = beside_a_wall(first, lights=[lamp])
+    index = inner_fragments(scene, "floor", 6)
+    a, b, c = (
+        reference.fragments(scene.changed(environment=e, lights=lights), index, models)[0]
+        for e, lights in ((first, [lamp]), (second, []), (mixed, [double]))
+    )
+    np.testing.assert_allclose(c, 2.0 * a + 0.5 * b, rtol=3e-4)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_size_of_the_world_does_not_matter(scale):
+    environment = random_map()
+    sun = DirectionalLight((1.0, 1.2, -0.3), (3.0, 2.0, 1.0))
+    for make in (over_the_ground, beside_a_wall):
+        size = {"radius": scale} if make is over_the_ground else {"scale": scale}
+        first, second = make(environment, lights=[sun]), make(environment, lights=[sun], **size)
+        np.testing.assert_array_equal(second.pixels, first.pixels)
+        part = first.parts[0] if make is beside_a_wall else "ground"
+        index = inner_fragments(first, part, 10)
+        a, b = (reference.fragments(s, index, [Lambert(0.5)])[0] for s in (first, second))
+        # rounding may turn the answer of a ray along an edge: one piece in a hundred thousand
+        np.testing.assert_allclose(b, a, rtol=2e-4)
+
+
+def test_nothing_is_asked_where_nothing_can_fall(monkeypatch):
+    """A sphere alone hides no light from itself: not a question, and the same as unshadowed."""
+    environment = random_map()
+    scene = Scene(sphere(), environment, camera=Camera.orbit(20.0, 10.0), size=8)
+    index = np.arange(0, len(scene.pixels), 15)
+    model = Lambert(0.5) + PerfectMirror(0.1)
+    plain, _ = reference.fragments(scene.changed(shadows=False), index, [model])
+    monkeypatch.setattr(Scene, "visible", None)
+    values, _ = reference.fragments(scene, index, [model])
+    np.testing.assert_array_equal(values, plain)
+    assert scene.rays_cast == 0
+
+
+@pytest.mark.parametrize("cell", [0.0, -0.1, math.nan])
+def test_pieces_need_a_size(cell):
+    normals, views = points(1)
+    with pytest.raises(ValueError, match="shadow_cell: expected an angle above 0 radians, got"):
+        reference.radiance(normals, views, [Lambert()], random_map(), shadow_cell=cell)
+
+
+# ---------------------------------------------------------------------------------------------
 # frames
 
 
-def test_render_places_the_points():
-    """By part, over the backdrop, each covered pixel as `radiance` has it."""
-    environment = random_map()
-    normals, views = points(3)
-    scene = types.SimpleNamespace(
-        parts=("lid", "body", "unseen"),
-        pixels=np.array([5, 0, 3]),
-        pixel_part=np.array([0, 1, 1]),
-        normals=normals,
-        views=views,
-        positions=np.zeros((3, 3)),
-        environment=environment,
-        lights=(PointLight((0.0, 5.0, 0.0), (9.0, 9.0, 9.0)),),
-        backdrop=lambda: np.full((2, 3, 3), 7.0, np.float32),
-    )
-    brdfs = {"lid": Lambert(0.9), "body": Lambert(0.3), "unseen": Lambert(0.1)}
-    image = reference.render(scene, brdfs)
-    assert image.shape == (2, 3, 3)
+@pytest.fixture(scope="module")
+def lit_scene():
+    """Borders, ground and a lamp; 4 x 5 pixels."""
+    lamp = PointLight((0.0, 5.0, 0.0), (9.0, 9.0, 9.0))
+    return over_the_ground(random_map(), [lamp], size=(4, 5), subsamples=4)
+
+
+def test_a_fragment_is_the_sum_of_its_samples(lit_scene):
+    """Its share of the pixel, sample by sample, whichever way it is asked for."""
+    scene, models = lit_scene, [Lambert(0.9), GGX(alpha=0.3)]
+    several = np.flatnonzero(np.diff(scene.offsets) > 1)
+    index = several[[3, 0, 5, 3, -1]]
+    values, error = reference.fragments(scene, index, models)
+    for f, value, stated in zip(index, values, error, strict=True):
+        rows = np.arange(scene.offsets[f], scene.offsets[f + 1])
+        each, errors = reference.radiance(
+            scene.normals[rows],
+            scene.views[rows],
+            models,
+            scene.environment,
+            [scene.arriving(light, rows) for light in scene.lights],
+            visible=lambda point, w, rows=rows: scene.visible(rows[point], w),
+        )
+        # of the four samples of its pixel, those that hit the part
+        np.testing.assert_allclose(value, each.sum(axis=0) / 4.0, rtol=1e-6)
+        np.testing.assert_allclose(stated, errors.sum(axis=0) / 4.0, rtol=1e-3)
+
+
+def test_frames_are_made_of_fragments(lit_scene):
+    scene = lit_scene
+    brdfs = {"sphere": Lambert(0.9), "ground": Lambert(0.3), "unseen": Lambert(0.1)}
+    told = []
+    image = reference.render(scene, brdfs, progress=lambda *what: told.append(what))
+    assert image.shape == (4, 5, 3)
     assert image.dtype == np.float64
-    flat = image.reshape(-1, 3)
-    np.testing.assert_array_equal(flat[[1, 2, 4]], 7.0)
-    values, _ = reference.radiance(
-        normals,
-        views,
-        [Lambert(0.9), Lambert(0.3)],
-        environment,
-        scene.lights,
-        scene.positions,
+    values, _ = reference.fragments(
+        scene, np.arange(len(scene.pixels)), [Lambert(0.9), Lambert(0.3)]
     )
-    np.testing.assert_allclose(flat[[5, 0, 3]], values[[0, 1, 2], [0, 1, 1]], rtol=1e-4)
-    np.testing.assert_allclose(reference.render(scene, Lambert(0.3)).reshape(-1, 3)[0], flat[0])
+    own = values[np.arange(len(values)), scene.pixel_part]
+    expected = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None].astype(np.float64)
+    for pixel, value in zip(scene.pixels, own, strict=True):
+        expected[pixel] += value
+    np.testing.assert_allclose(image.reshape(-1, 3), expected, rtol=2e-4)
+    # pixels of three kinds: whole, shared by two parts, and open to the backdrop
+    shared = np.bincount(scene.pixels, minlength=20) > 1
+    assert shared.any()
+    assert np.any((scene.uncovered > 0.0) & (scene.uncovered < 1.0))
+    assert np.any(scene.uncovered == 1.0)
+    assert [name for name, _ in told] == ["reference"] * len(told)
+    fractions = [done for _, done in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+
+
+def test_one_brdf_serves_all_parts(lit_scene):
+    scene = lit_scene.changed(environment=EnvironmentMap(np.zeros((2, 4, 3))))
+    alone = reference.render(scene, Lambert(0.3))
+    each = reference.render(scene, {"sphere": Lambert(0.3), "ground": Lambert(0.3)})
+    np.testing.assert_array_equal(alone, each)
+    assert alone.any()
+
+
+def test_every_part_seen_needs_a_brdf(lit_scene):
+    with pytest.raises(ValueError, match=r"got none for \['ground'\]"):
+        reference.render(lit_scene, {"sphere": Lambert(0.3)})
+
+
+def test_there_must_be_such_a_fragment(lit_scene):
+    with pytest.raises(IndexError):
+        reference.fragments(lit_scene, [10_000], [Lambert(0.3)])
 
 
 def test_relative_error_is_the_mean_over_the_mean():

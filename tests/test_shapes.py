@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
+import time
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion, binary_fill_holes
+from scipy.spatial import ConvexHull
 
 from traitbrdf.formats import FormatError
 from traitbrdf.shapes import MIN_COSINE, Hits, Mesh, Shape, load_mesh, sphere, teapot
@@ -61,9 +64,10 @@ def view(
 def check_hits(hits: Hits, directions: NDArray[np.float64]) -> None:
     """What holds for the hits of every shape."""
     assert hits.part.dtype == np.int32
-    assert hits.position.dtype == hits.normal.dtype == np.float64
+    assert hits.position.dtype == hits.normal.dtype == hits.start.dtype == np.float64
     hit = hits.part >= 0
-    assert not hits.position[~hit].any() and not hits.normal[~hit].any()
+    for missed in (hits.position[~hit], hits.normal[~hit], hits.start[~hit]):
+        assert not missed.any()
     assert np.allclose(np.linalg.norm(hits.normal[hit], axis=1), 1.0, atol=1e-12)
     assert np.all(np.sum(hits.normal[hit] * directions[hit], axis=1) <= 0.0)
 
@@ -125,6 +129,13 @@ def test_sphere_does_not_shadow_its_own_surface(scale: float) -> None:
     assert not ball.occluded(center + scale * normal, w).any()
     inwards = np.abs(np.sum(w * normal, axis=1)) > 1e-3
     assert ball.occluded(center + scale * normal, -w)[inwards].all()
+
+
+def test_sphere_lowest_point_and_start_of_shadow_rays() -> None:
+    ball = sphere(2.0, (1.0, 5.0, 0.0))
+    assert ball.lowest == 3.0
+    hits = ball.intersect(*view(ball, 20.0, 30.0, 8))
+    np.testing.assert_array_equal(hits.start, hits.position)
 
 
 @pytest.mark.parametrize("shape", [sphere(), teapot(4)])
@@ -388,6 +399,216 @@ def test_mesh_can_be_copied() -> None:
     assert np.array_equal(hits.position, expected.position)
 
 
+# ------------------------------------------------------------- mesh: where shadow rays start
+
+
+def bulging_triangle(*bend: float) -> Mesh:
+    """An equilateral triangle that faces +z; its corners' normals lean outwards by sines `bend`."""
+    angle = np.radians([90.0, 210.0, 330.0])
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(3)], axis=1)
+    sine = np.array(bend)[:, None]
+    normals = sine * around + np.sqrt(1.0 - sine**2) * np.array([0.0, 0.0, 1.0])
+    return Mesh(around, [[0, 1, 2]], normals, [0], ("t",))
+
+
+@pytest.mark.parametrize(("bend", "side"), [(0.3, 1.0), (-0.3, -1.0)])
+def test_a_bulging_triangle_lifts_the_start_by_hand(bend: float, side: float) -> None:
+    # at the centroid each tangent plane is |bend| off along its normal; what is across cancels
+    tri = bulging_triangle(bend, bend, bend)
+    origin, down = np.array([0.0, 0.0, side * 5.0]), np.array([[0.0, 0.0, -side]])
+    hits = tri.intersect(origin, down)
+    lift = abs(bend) * np.sqrt(1.0 - bend**2)
+    assert np.allclose(hits.start[0], [0.0, 0.0, side * (lift + 1e-4 * tri.radius)], atol=1e-7)
+    # from the other side it is hollow, and nothing is lifted
+    hollow = tri.intersect(-origin, -down)
+    assert np.allclose(hollow.start[0], [0.0, 0.0, -side * 1e-4 * tri.radius], atol=1e-7)
+
+
+def test_only_the_corners_that_bulge_lift_the_start() -> None:
+    saddle = bulging_triangle(0.3, -0.3, 0.0)
+    hits = saddle.intersect(np.array([0.0, 0.0, 5.0]), np.array([[0.0, 0.0, -1.0]]))
+    expected = 0.1 * saddle.normals[0] + [0.0, 0.0, 1e-4 * saddle.radius]
+    assert np.allclose(hits.start[0], expected, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(SCALES))
+def test_shadow_rays_start_on_the_side_that_is_seen(seed: int, scale: float) -> None:
+    # whatever the normals say: at least the offset above the triangle
+    rng = np.random.default_rng(seed)
+    corner = scale * rng.normal(size=(3, 3))
+    tri = Mesh(corner, [[0, 1, 2]], rng.normal(size=(3, 3)), [0], ("t",))
+    target = rng.dirichlet(np.ones(3), 20) @ corner
+    d = unit(rng.normal(size=(20, 3)))
+    hits = tri.intersect(target - 3.0 * tri.radius * d, d)
+    check_hits(hits, d)
+    hit = hits.part >= 0
+    facet = unit(np.cross(corner[1] - corner[0], corner[2] - corner[0]))
+    above = (hits.start - hits.position) @ facet * -np.sign(d @ facet)
+    assert np.all(above[hit] >= 0.999e-4 * tri.radius)
+    assert not tri.occluded(hits.start[hit], -d[hit]).any()
+
+
+def test_flat_shading_lifts_nothing() -> None:
+    flat = np.cross(*np.moveaxis(np.diff(TETRAHEDRON[TETRAHEDRON_FACES], axis=1), 1, 0))
+    solid = Mesh(
+        TETRAHEDRON, TETRAHEDRON_FACES, np.repeat(flat[:, None], 3, axis=1), [0] * 4, ["t"]
+    )
+    hits = solid.intersect(*view(solid, 35.0, 20.0, 24))
+    assert np.count_nonzero(hits.part == 0) > 50
+    away = (hits.start - hits.position)[hits.part == 0]
+    assert np.allclose(away, 1e-4 * solid.radius * hits.normal[hits.part == 0], atol=1e-12)
+
+
+def test_the_lowest_point_is_that_of_the_triangles_kept() -> None:
+    vertices = np.vstack([TETRAHEDRON + np.array([0.0, 2.0, 0.0]), [0.0, -9.0, 0.0]])
+    solid = Mesh(vertices, TETRAHEDRON_FACES, np.ones((5, 3)), [0] * 4, ["t"])
+    assert solid.lowest == 2.0
+    assert teapot(4).lowest == pytest.approx(0.0, abs=1e-12)
+
+
+# ------------------------------------------------------------------------------- mesh: convexity
+
+
+def plain(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
+    """A mesh of one part whose normals do not matter."""
+    return Mesh(
+        vertices, faces, np.tile([0.0, 1.0, 0.0], (len(vertices), 1)), [0] * len(faces), ["a"]
+    )
+
+
+def solid(made: trimesh.Trimesh) -> Mesh:
+    return plain(made.vertices, made.faces)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(4, 80), st.sampled_from(SCALES))
+def test_convex_hulls_are_convex_and_dented_ones_not(seed: int, count: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = unit(rng.normal(size=(count, 3))) * rng.uniform(0.5, 2.0, 3)
+    hull = trimesh.convex.convex_hull(points)
+    vertices = scale * (hull.vertices + rng.normal(size=3))
+    faces = rng.permutation(hull.faces)
+    faces[::2] = faces[::2, ::-1]  # winding does not matter
+    body = plain(vertices, faces)
+    assert body.convex
+    # float32, as files store it
+    assert plain(vertices.astype(np.float32), faces).convex
+    assert not plain(vertices, faces[1:]).convex  # open
+    # a corner pushed a twentieth of its way to the middle leaves a dent, unless it stays outmost
+    inward = hull.vertices.copy()
+    at = faces[0, 0]
+    inward[at] += 0.05 * (inward.mean(axis=0) - inward[at])
+    a, b, c = (inward[hull.faces[:, i]] for i in range(3))
+    volume = np.sum(np.cross(a, b) * c) / 6.0
+    if ConvexHull(inward).volume > 1.001 * volume:
+        assert not plain(inward, faces).convex
+
+
+def great_icosahedron() -> trimesh.Trimesh:
+    """Twenty large triangles that pass through one another; each edge bends outwards."""
+    corner = trimesh.creation.icosahedron().vertices
+    apart = np.linalg.norm(corner[:, None] - corner[None], axis=-1).round(6)
+    far = np.unique(apart)[2]
+    faces = [
+        c
+        for c in itertools.combinations(range(12), 3)
+        if all(apart[a, b] == far for a, b in itertools.combinations(c, 2))
+    ]
+    assert len(faces) == 20
+    return trimesh.Trimesh(corner, faces, process=False)
+
+
+def shrunk_corner(factor: float) -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    corner = ball.vertices.copy()
+    corner[7] *= factor
+    return trimesh.Trimesh(corner, ball.faces, process=False)
+
+
+def together(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.util.concatenate(meshes)
+
+
+BOX = trimesh.creation.box()
+
+
+@pytest.mark.parametrize(
+    ("made", "convex"),
+    [
+        (BOX, True),
+        (trimesh.creation.icosphere(subdivisions=3), True),
+        (trimesh.creation.cylinder(1.0, 2.0), True),
+        (shrunk_corner(0.9999), True),  # stays outside its neighbours' planes
+        (shrunk_corner(0.99), False),
+        (shrunk_corner(1.05), False),
+        (trimesh.creation.torus(2.0, 0.5), False),
+        (great_icosahedron(), False),
+        (together(BOX, trimesh.creation.box(extents=[0.2] * 3)), False),
+        (together(BOX, BOX.copy().apply_translation([3.0, 0.0, 0.0])), False),
+        (together(BOX, BOX.copy().apply_translation([1.0, 0.0, 0.0])), False),
+        (trimesh.Trimesh(TETRAHEDRON[:3], [[0, 1, 2], [0, 2, 1]], process=False), False),
+        (trimesh.Trimesh(TETRAHEDRON[:3], [[0, 1, 2]], process=False), False),
+    ],
+)
+def test_convexity_of_known_shapes(made: trimesh.Trimesh, convex: bool) -> None:
+    assert solid(made).convex is convex
+
+
+def test_a_finely_cut_box_is_convex_in_float32() -> None:
+    box = trimesh.creation.box()
+    for _ in range(4):
+        box = box.subdivide()
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    assert plain((box.vertices @ turn + 3.0).astype(np.float32), box.faces).convex
+
+
+def test_small_dents_that_add_up_are_found() -> None:
+    # a fine grid, each of whose edges bends inwards by less than what counts as bent
+    n = 200
+    grid = np.linspace(-1.0, 1.0, n + 1)
+    x, z = (a.ravel() for a in np.meshgrid(grid, grid))
+    bowl = 2e-4 * (x**2 + z**2 - 2.0)
+    top = np.stack([x, bowl, z], axis=1)
+    corner = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = (q.ravel() for q in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:],
+                                      corner[1:, :-1]))  # fmt: skip
+    lid = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    rim = np.concatenate([corner[0], corner[1:, -1], corner[-1, -2::-1], corner[-2:0:-1, 0]])
+    tip = np.full(len(rim), len(top))
+    side = np.stack([rim, np.roll(rim, -1), tip], 1)
+    vertices = np.vstack([top, [0.0, -2.0, 0.0]])
+    bent = plain(vertices, np.concatenate([lid, side]))
+    vertices[:, 1] = np.where(vertices[:, 1] < -1.0, -2.0, 0.0)
+    assert plain(vertices, np.concatenate([lid, side])).convex
+    assert not bent.convex
+
+
+def test_very_large_meshes_are_not_taken_for_convex() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=7)
+    assert len(ball.faces) > 200_000
+    start = time.perf_counter()
+    assert solid(ball).convex is False
+    assert time.perf_counter() - start < 20.0
+
+
+# ------------------------------------------------------------------- mesh: texture coordinates
+
+
+def test_texture_coordinates_are_kept_with_the_faces() -> None:
+    faces = np.vstack([[[0, 0, 1]], TETRAHEDRON_FACES])  # the first has no area
+    corner = np.arange(5 * 3 * 2.0).reshape(5, 3, 2)
+    made = Mesh(TETRAHEDRON, faces, np.ones((4, 3)), [0] * 5, ["t"], corner)
+    np.testing.assert_array_equal(made.uvs, corner[1:])
+    np.testing.assert_array_equal(copy.deepcopy(made).uvs, corner[1:])
+    plane = corner[:2, :2].reshape(4, 2)
+    per_vertex = Mesh(TETRAHEDRON, faces, np.ones((4, 3)), [0] * 5, ["t"], plane)
+    assert per_vertex.uvs.shape == (4, 2)
+    assert copy.deepcopy(teapot(3)).uvs is None
+    with pytest.raises(ValueError, match="read-only"):
+        made.uvs[0] = 0.0
+
+
 def test_corner_normals_may_differ_at_a_vertex() -> None:
     pot = teapot(3)
     corner = Mesh(pot.vertices, pot.faces, pot.normals[pot.faces], pot.face_part, pot.parts)
@@ -410,6 +631,7 @@ def test_corner_normals_may_differ_at_a_vertex() -> None:
     [
         ({"vertices": np.zeros((4, 2))}, "vertices: expected shape"),
         ({"vertices": np.full((4, 3), np.inf)}, "vertices: expected finite"),
+        ({"vertices": np.where(TETRAHEDRON == 1.0, np.nan, 0.0)}, "vertices: expected finite"),
         ({"vertices": np.ones((4, 3))}, "vertices: expected a finite size"),
         ({"vertices": np.outer(np.arange(4.0), [1.0, 1.0, 1.0])}, "triangles with an area"),
         ({"faces": np.zeros((0, 3), dtype=int)}, "faces: expected integers"),
@@ -421,6 +643,8 @@ def test_corner_normals_may_differ_at_a_vertex() -> None:
         ({"face_part": [0, 0, 0]}, "face_part: expected 4 integers"),
         ({"face_part": [0, 0, 0, 1]}, "face_part: expected indices"),
         ({"parts": ("a", "a")}, "unique names"),
+        ({"uvs": np.zeros((4, 3))}, r"uvs: expected shape \(4, 2\) or \(4, 3, 2\)"),
+        ({"uvs": np.full((4, 2), np.nan)}, "uvs: expected finite"),
     ],
 )
 def test_mesh_arguments_are_checked(change: dict[str, object], message: str) -> None:
@@ -491,6 +715,48 @@ def test_obj_keeps_its_own_normals(tmp_path: Path) -> None:
     assert np.allclose(hits.normal, [[0.5**0.5, 0.0, 0.5**0.5], [0.0, 0.0, 1.0]])
 
 
+def test_obj_keeps_texture_coordinates(tmp_path: Path) -> None:
+    path = tmp_path / "seam.obj"
+    path.write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+        "vt 0 0.25\nvt 1\nvt 0.5 1 0\nvn 0 0 1\n"
+        "g b\nf 1/1 2/-2/1 3/3/1\n"  # relative, with and without a normal
+        "g a\nf 2/3 4/1 3/2\nf 1 2 4\nf 1/9 3/1 4/1\n"  # none; one that is missing
+    )
+    made = load_mesh(path)
+    assert made.parts == ("b", "a")
+    expected = [
+        [[0.0, 0.25], [1.0, 0.0], [0.5, 1.0]],
+        [[0.5, 1.0], [0.0, 0.25], [1.0, 0.0]],
+        [[0.0, 0.0]] * 3,
+        [[0.0, 0.0], [0.0, 0.25], [0.0, 0.25]],
+    ]
+    np.testing.assert_array_equal(made.uvs, expected)
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\n")
+    assert load_mesh(path).uvs is None
+
+
+def test_obj_relative_indices_count_from_where_they_stand(tmp_path: Path) -> None:
+    path = tmp_path / "relative.obj"
+    path.write_text(
+        "g a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\ng b\nv 5 0 0\nv 6 0 0\nv 5 1 0\nf -3 -2 -1\n"
+    )
+    made = load_mesh(path)
+    assert made.vertices[made.faces[made.face_part == 0]].max() == 1.0
+    assert made.vertices[made.faces[made.face_part == 1]][..., 0].min() == 5.0
+
+
+def test_obj_groups_without_faces_are_no_parts(tmp_path: Path) -> None:
+    path = tmp_path / "empty.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\ng none\ng some\nf 1 2 3\ng last\n")
+    assert load_mesh(path).parts == ("some",)
+    # a group that comes twice is one part
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\ng a\nf 1 2 3\ng b\nf 1 3 2\ng a\nf 2 3 1\n")
+    made = load_mesh(path)
+    assert made.parts == ("a", "b")
+    assert made.face_part.tolist() == [0, 0, 1]
+
+
 def test_smooth_normals_cross_the_borders_of_parts(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     upper = ball.triangles_center[:, 1] > 0.0
@@ -514,6 +780,52 @@ def test_ply_is_one_part_named_after_the_file(tmp_path: Path) -> None:
     assert mesh.radius == pytest.approx(2.0, rel=1e-3)
     hits = mesh.intersect(np.array([0.1, 0.2, 9.0]), np.array([[0.0, 0.0, -1.0]]))
     assert np.allclose(hits.normal[0], unit(hits.position[0]), atol=0.02)
+
+
+def test_ply_keeps_texture_coordinates_and_normals_at_a_seam(tmp_path: Path) -> None:
+    path = tmp_path / "seam.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 5\n"
+        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+        + "element face 2\nproperty list uchar int vertex_indices\n"
+        "property list uchar float texcoord\nend_header\n"
+        "9 9 9 1 0 0\n"  # in no face
+        "0 0 0 0 0 1\n1 0 0 0 0.6 0.8\n1 1 0 0 0 1\n0 1 0 0.6 0 0.8\n"
+        "3 1 2 3 6 0 0 1 0 1 1\n"
+        "3 1 3 4 6 0.5 0 1 0.5 0 1\n"  # the shared edge lies elsewhere in the picture
+    )
+    made = load_mesh(path)
+    corner = made.normals if made.normals.ndim == 3 else made.normals[made.faces]
+    assert np.allclose(corner[0], [[0, 0, 1], [0, 0.6, 0.8], [0, 0, 1]], atol=1e-6)
+    assert np.allclose(corner[1], [[0, 0, 1], [0, 0, 1], [0.6, 0, 0.8]], atol=1e-6)
+    assert np.allclose(made.uvs[0], [[0, 0], [1, 0], [1, 1]])
+    assert np.allclose(made.uvs[1], [[0.5, 0], [1, 0.5], [0, 1]])
+    assert np.allclose(made.vertices[made.faces[1]][:, :2], [[0, 0], [1, 1], [0, 1]])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+def test_texture_coordinates_go_round(tmp_path: Path, suffix: str) -> None:
+    # v is up in memory, whichever way the format counts
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=0.25 * box.vertices[:, :2] + [0.5, 0.25])
+    path = tmp_path / f"box.{suffix}"
+    box.export(path)
+    made = load_mesh(path)
+    expected = 0.25 * made.vertices[made.faces][..., :2] + [0.5, 0.25]
+    assert np.allclose(made.uvs, expected, atol=1e-6)
+    assert made.convex
+
+
+def test_a_mirrored_gltf_node_keeps_its_texture_on_its_corners(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2] + 0.5)
+    scene = trimesh.Scene()
+    scene.add_geometry(box, transform=np.diag([-2.0, 1.0, 1.0, 1.0]))
+    path = tmp_path / "mirrored.glb"
+    scene.export(path)
+    made = load_mesh(path)
+    expected = made.vertices[made.faces][..., :2] * [-0.5, 1.0] + 0.5
+    assert np.allclose(made.uvs, expected, atol=1e-6)
 
 
 def test_glb_scene_keeps_names_and_transforms(tmp_path: Path) -> None:

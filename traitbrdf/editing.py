@@ -3,20 +3,38 @@
 Every part (region) of the shape has one material: coordinates in the embedding, and, where a
 table or a model was assigned, what that table has beyond the manifold, which edits keep. All
 edits are undone and redone one at a time; a stroke is one edit.
+
+*Views.* Camera, light and size are not part of the materials: `EditSession.look` changes them.
+What is prepared for one view lies in one object (`_View`) that the next look replaces as a whole,
+so that no frame of an old view can turn up later.
+
+*Threads.* A preparation may run behind (`prepare(wait=False)`). It works on what it was given,
+publishes its result in one step under the session's lock, and stops at its next sign of progress
+when it is cancelled. Heavy work takes turns (`_Turns`): drafts and exact frames, which somebody
+waits for, go first.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import hashlib
+import importlib.metadata
 import json
 import math
+import os
+import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, field, replace
+from importlib import resources
 from os import PathLike
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
@@ -24,16 +42,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.embedding import BRDFEmbedding, Library, default_library
-from traitbrdf.formats import FormatError, read_arrays, unknown_name, write_arrays
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, PointLight
+from traitbrdf.formats import FormatError, atomic_path, read_arrays, unknown_name, write_arrays
+from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, LightTree, PointLight
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
 from traitbrdf.traits import GROUPS, TraitSpace, default_traits
-from traitbrdf.transport import PartFrame, Progress, Training, Transport, training_tables
+from traitbrdf.transport import (
+    Draft,
+    PartFrame,
+    Progress,
+    Training,
+    Transport,
+    training_tables,
+)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 QUALITIES: dict[str, tuple[int, float]] = {
     "preview": (24, 0.7),
@@ -42,11 +68,31 @@ QUALITIES: dict[str, tuple[int, float]] = {
 }
 """Basis images and resolution of the light for each quality."""
 
-EXACT_ABOVE = 0.05
-"""A part whose measured error is greater is rendered without the basis, if no error is asked."""
+EXACT_ABOVE = 0.01
+"""The error that every shown part has to meet by its own measurement, if none is asked for."""
 
-_FORMAT = 1
+TRUSTED = 0.7
+"""The basis is used where its measured error is at most this share of the error asked for: some
+dozens of probes are a noisy measurement."""
+
+TRAINED_IMAGES = 8
+"""At most so many exact images are taken into the basis of a part."""
+
+DRAFT_SIZE = 128
+"""Pixels along the longer side of a draft."""
+
+FRAMES_KEPT = 1 << 27
+"""Bytes of finished parts that are kept, so that what is undone is shown again as it was."""
+
+CACHE_BYTES = 2_000_000_000
+"""Preparations on disk take at most so many bytes, unless TRAITBRDF_CACHE_BYTES says otherwise."""
+
+_FORMAT = 2
+_CACHE_FORMAT = 1
 _FIRST_MATERIAL = "white-plastic"
+_FIRST_GROUND = "concrete"
+_TICK = 0.2  # seconds between two looks at how far a preparation has come
+_FAREWELL = 5.0  # seconds that the interpreter's end waits for a cancelled preparation
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +114,27 @@ class Material:
     table: Float32 | None = None
     name: str = ""
 
-    def values(self, embedding: BRDFEmbedding) -> Float32:
-        """f_r (cells, 3) on the embedding's grid."""
-        if self.table is not None:
-            return self.table
-        return embedding.decode_values(self.z, self.offset)
+    def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
+        """f_r (n, 3) at `cells` (n,) of the embedding's grid; at all of them if left out."""
+        if self.table is None:
+            return embedding.decode_values(self.z, self.offset, cells)
+        return self.table if cells is None else self.table.take(cells, axis=0)
+
+
+@dataclass(frozen=True)
+class _Said:
+    """The call that did an edit.
+
+    A stroke lies on the image: where the picture has been framed anew since, `anywhere` says the
+    same part by part.
+    """
+
+    call: str
+    anywhere: str = ""
+    framing: tuple[Camera, int, int] | None = None
+
+    def under(self, framing: tuple[Camera, int, int]) -> str:
+        return self.call if not self.anywhere or framing == self.framing else self.anywhere
 
 
 @dataclass(frozen=True)
@@ -81,7 +143,282 @@ class _Edit:
 
     before: dict[str, Material]
     after: dict[str, Material]
-    call: str
+    said: _Said
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """One part's shading as it is shown, how it was made, and what that took."""
+
+    frame: PartFrame
+    tier: Literal["basis", "trained", "exact"]
+    seconds: float
+
+
+class _StopError(Exception):
+    """Raised through a preparation that was cancelled."""
+
+
+class _Turns:
+    """Who computes: heavy work comes one after the other, what somebody waits for first.
+
+    Two at once would only slow each other down, and where numba has no better threading layer its
+    loops must not be entered by two threads.
+    """
+
+    def __init__(self) -> None:
+        self._change = threading.Condition()
+        self._owner: object = None
+        self._urgent = 0
+
+    def take(self, owner: object, urgent: bool, stopped: Callable[[], bool]) -> None:
+        """Wait for a turn; `_StopError` as soon as `stopped()`, looked at upon `wake`."""
+        with self._change:
+            self._urgent += urgent
+            try:
+                self._change.wait_for(
+                    lambda: stopped() or (self._owner is None and (urgent or not self._urgent))
+                )
+            finally:
+                self._urgent -= urgent
+                self._change.notify_all()
+            if stopped():
+                raise _StopError
+            self._owner = owner
+
+    def give(self, owner: object) -> None:
+        """End the owner's turn; nothing happens if it has none."""
+        with self._change:
+            if self._owner is owner:
+                self._owner = None
+                self._change.notify_all()
+
+    def wake(self) -> None:
+        with self._change:
+            self._change.notify_all()
+
+    @contextlib.contextmanager
+    def urgent(self) -> Iterator[None]:
+        """A turn for what somebody waits for."""
+        owner = object()
+        self.take(owner, True, lambda: False)
+        try:
+            yield
+        finally:
+            self.give(owner)
+
+
+_TURNS = _Turns()
+
+
+class _LightTrees:
+    """The light tree of the map in use; turning a map leaves its tree as it is."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._image: Float32 | None = None
+        self._tree: LightTree | None = None
+
+    def of(self, environment: EnvironmentMap) -> LightTree:
+        with self._lock:
+            if self._tree is None or self._image is not environment.image:
+                self._tree, self._image = LightTree.build(environment), environment.image
+            return self._tree
+
+
+class _Preparation:
+    """One run of a view's preparation, in whatever thread calls `run`.
+
+    Attributes
+    ----------
+    done : set once it has ended, well or not
+    stopped : whether it was cancelled
+    error : what it failed with
+    fraction : how much is done, never falling
+    thread : where it runs
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Progress], tuple[Transport, bool]],
+        publish: Callable[[_Preparation, Transport, bool], None],
+        progress: Progress | None,
+        wanted: Callable[[], object],
+    ) -> None:
+        self.done = threading.Event()
+        self.error: BaseException | None = None
+        self.fraction = 0.0
+        self.seconds = 0.0
+        self.thread: threading.Thread | None = None
+        self._work = work
+        self._publish = publish
+        self._progress = progress
+        self._wanted = wanted
+        self._stop = threading.Event()
+
+    @property
+    def stopped(self) -> bool:
+        return self._stop.is_set()
+
+    def stop(self) -> None:
+        """End it at its next sign of progress."""
+        self._stop.set()
+        _TURNS.wake()
+
+    def start(self) -> None:
+        """Run behind. The thread does not keep the interpreter from ending."""
+        self.thread = threading.Thread(target=self.run, name="traitbrdf-prepare", daemon=True)
+        _RUNNING.add(self)
+        self.thread.start()
+
+    def run(self) -> None:
+        self.thread = threading.current_thread()
+        start = time.perf_counter()
+        try:
+            self._take()
+            try:
+                transport, cached = self._work(self._told)
+            finally:
+                _TURNS.give(self)
+            self.seconds = time.perf_counter() - start
+            self._publish(self, transport, cached)
+        except _StopError:
+            pass
+        except BaseException as error:  # also an interruption: whoever waits raises it
+            self.error = error
+        finally:
+            self.done.set()
+
+    def _take(self) -> None:
+        # nobody waits for the preparation of a session that is gone
+        _TURNS.take(self, False, lambda: self.stopped or self._wanted() is None)
+
+    def _told(self, stage: str, fraction: float) -> None:
+        self.fraction = max(self.fraction, min(fraction, 0.99))
+        # others take their turns here, and what is called may compute as well
+        _TURNS.give(self)
+        if self._progress is not None and not self.stopped:
+            self._progress(stage, fraction)
+        self._take()
+
+
+_RUNNING: weakref.WeakSet[_Preparation] = weakref.WeakSet()
+
+
+@atexit.register
+def _end_preparations() -> None:
+    """Threads that are cut off inside compiled code would take the process down with them."""
+    running = list(_RUNNING)
+    for job in running:
+        job.stop()
+    for job in running:
+        job.done.wait(_FAREWELL)
+
+
+class _Canvas:
+    """The frame on the device, of which only the pixels of changed parts are drawn again.
+
+    A pixel at a border is the sum of the backdrop and its parts, in the order of the parts, each
+    time it is drawn: so the image depends on nothing but the parts' frames.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        scene = transport.scene
+        self._transport = transport
+        sizes = [0 if part is None else len(part.pixels) for part in transport.parts]
+        black = [PartFrame(torch.zeros(n, 3, device=transport.device), 0.0, 0.0) for n in sizes]
+        self._backdrop = transport.compose(black).reshape(-1, 3)
+        several = np.bincount(scene.pixels, minlength=len(scene.uncovered)) > 1
+        # the share of the pixel that shows the backdrop is a part of the sum as well
+        self._mixed = (several | (scene.uncovered > 0.0))[scene.pixels]
+        self._patches: dict[int | None, tuple[torch.Tensor, list[Any]]] = {}
+        self._drawn: list[PartFrame] = []
+        self._image = self._backdrop
+        self.changed: list[int] = []
+
+    def draw(self, frames: list[PartFrame]) -> None:
+        """Bring the image up to the parts' frames; `changed` are those that were drawn."""
+        drawn, self._drawn = self._drawn, []  # what is cut off half way is drawn as a whole again
+        if drawn:
+            pairs = zip(frames, drawn, strict=True)
+            self.changed = [i for i, (new, old) in enumerate(pairs) if new is not old]
+            self.redraw(self.changed, frames)
+        else:
+            self.changed = list(range(len(frames)))
+            self._image = self._transport.compose(frames).reshape(-1, 3)
+        self._drawn = frames
+
+    def redraw(self, changed: list[int], frames: list[PartFrame]) -> None:
+        """Draw the pixels of the parts `changed`."""
+        for i in changed:
+            part = self._transport.parts[i]
+            if part is not None:
+                self._image.index_copy_(0, part.pixels, frames[i].radiance)
+        if changed:
+            pixels, places = self._patch(changed[0] if len(changed) == 1 else None)
+            sums = self._backdrop[pixels]
+            for i, fragments, place in places:
+                sums.index_add_(0, place, frames[i].radiance[fragments])
+            self._image.index_copy_(0, pixels, sums)
+
+    def _patch(self, part: int | None) -> tuple[torch.Tensor, list[Any]]:
+        """Pixels that are sums and show `part` (None: any), and what falls on which of them."""
+        if part not in self._patches:
+            scene = self._transport.scene
+            chosen = self._mixed.copy()
+            if part is not None:
+                chosen &= scene.pixel_part == part
+            pixels = np.unique(scene.pixels[chosen])
+            places = []
+            for i in range(len(scene.parts)):
+                span = scene.part_slice(i)
+                fragments = np.flatnonzero(np.isin(scene.pixels[span], pixels))
+                if len(fragments):
+                    place = np.searchsorted(pixels, scene.pixels[span][fragments])
+                    places.append((i, self._tensor(fragments), self._tensor(place)))
+            self._patches[part] = self._tensor(pixels), places
+        return self._patches[part]
+
+    def _tensor(self, index: Int64) -> torch.Tensor:
+        return torch.from_numpy(index).to(self._transport.device)
+
+    def image(self) -> Float32:
+        """A copy (H, W, 3) of the frame."""
+        scene = self._transport.scene
+        return np.array(self._image.cpu().numpy()).reshape(scene.height, scene.width, 3)
+
+
+@dataclass(eq=False)
+class _View:
+    """All that belongs to one scene of the session: the next look replaces it as a whole."""
+
+    scene: Scene
+    job: _Preparation | None = None
+    transport: Transport | None = None
+    cached: bool = False
+    canvas: _Canvas | None = None
+    shown: list[_Shown] = field(default_factory=list)
+    kept: OrderedDict[tuple[int, Material], _Shown] = field(default_factory=OrderedDict)
+    kept_bytes: int = 0
+    trained: dict[int, int] = field(default_factory=dict)
+    budget: dict[int, int] = field(default_factory=dict)
+    floor: dict[int, float] = field(default_factory=dict)
+    exact_frames: int = 0
+    draft: Draft | None = None
+    drafted: tuple[tuple[Material, ...], Float32, float] | None = None
+    times: dict[str, float] = field(default_factory=dict)
+
+    def keep(self, index: int, material: Material, shown: _Shown) -> None:
+        """Keep a part's shading, the least recently used ones going first."""
+        self.kept[index, material] = shown
+        self.kept_bytes += _size(shown)
+        while self.kept_bytes > FRAMES_KEPT and len(self.kept) > len(self.scene.parts):
+            _, old = self.kept.popitem(last=False)
+            self.kept_bytes -= _size(old)
+
+
+def _size(shown: _Shown) -> int:
+    return shown.frame.radiance.numel() * shown.frame.radiance.element_size()
 
 
 class EditSession:
@@ -93,15 +430,20 @@ class EditSession:
     quality : "preview", "interactive" or "accurate"
     error : float or None
         The mean relative L1 that every shown part has to meet by its own measurement; parts that
-        do not are rendered without the basis, which takes seconds. None is 0.05.
+        do not are rendered without the basis, which takes seconds, and taught to it. None is 0.01.
     library, embedding, traits : what to edit with; None is what the package ships
     device : torch device for frames
     seed : int, of the preparation's random choices
-    progress : called with (stage, fraction) while the scene is prepared; may raise to cancel
+    progress : called with (stage, fraction) while the scene is prepared, from the thread that
+        prepares; may raise to cancel
+    cache : bool
+        Whether finished preparations are kept on disk: in $TRAITBRDF_CACHE or the user's cache
+        folder, the least recently used ones going beyond 2 GB ($TRAITBRDF_CACHE_BYTES; 0 is off).
 
     Notes
     -----
-    The scene is prepared at the first `render` (or by `prepare`).
+    The scene is prepared at the first `render` (or by `prepare`), behind if asked for; `draft`
+    gives a first image at once. Every method may be called from any thread.
     """
 
     def __init__(
@@ -114,6 +456,7 @@ class EditSession:
         device: str | torch.device = "cpu",
         seed: int = 0,
         progress: Progress | None = None,
+        cache: bool = True,
     ) -> None:
         if not isinstance(scene, Scene):
             raise TypeError(f"scene: expected a Scene, got {scene!r}")
@@ -121,7 +464,6 @@ class EditSession:
             raise ValueError(unknown_name("quality", quality, tuple(QUALITIES)))
         if error is not None and not (math.isfinite(error) and error > 0.0):
             raise ValueError(f"error: expected a positive number, got {error!r}")
-        self.scene = scene
         self.quality = quality
         self.error = error
         self.library = default_library() if library is None else library
@@ -130,17 +472,25 @@ class EditSession:
         self.device = torch.device(device)
         self.seed = seed
         self._progress = progress
-        self._transport: Transport | None = None
-        self._frames: dict[str, tuple[Material, PartFrame, str]] = {}
-        self._times: dict[str, float] = {}
-        first = _FIRST_MATERIAL if _FIRST_MATERIAL in self.library else self.library.names[0]
-        self._materials = {part: self._from_library(first) for part in scene.parts}
+        self._cache = _Cache.usual() if cache else None
+        self._trees = _LightTrees()
+        self._lock = threading.RLock()
+        self._view = _View(scene)
+        first = self._first(_FIRST_MATERIAL)
+        self._materials = dict.fromkeys(scene.parts, first)
+        if scene.ground:
+            self._materials[scene.parts[-1]] = self._first(_FIRST_GROUND)
         self._done: list[_Edit] = []
         self._undone: list[_Edit] = []
-        self._replayed: list[str] = []
+        self._replayed: list[_Said] = []
 
     def __repr__(self) -> str:
         return f"EditSession({self.scene!r}, quality={self.quality!r}, {len(self._done)} edits)"
+
+    @property
+    def scene(self) -> Scene:
+        """What is looked at; `look` replaces it."""
+        return self._view.scene
 
     # -- materials ------------------------------------------------------------------------------
 
@@ -171,9 +521,20 @@ class EditSession:
             return 1.0
         return self.embedding.energy_scale(material.z, material.offset)
 
+    def _first(self, name: str) -> Material:
+        return self._from_library(name if name in self.library else self.library.names[0])
+
     def _from_library(self, name: str) -> Material:
         z = self.library.coordinates[self.library.index(name)]
         return Material(self.embedding.clip(z), np.zeros(3), name=name)
+
+    def _names(self, part: str | Iterable[str]) -> list[str]:
+        names = [part] if isinstance(part, str) else list(part)
+        if not names:
+            raise ValueError("part: expected at least one name, got none")
+        for name in names:
+            self.part(name)
+        return names
 
     # -- edits ----------------------------------------------------------------------------------
 
@@ -192,11 +553,7 @@ class EditSession:
         TypeError
             On something that is no material.
         """
-        names = [part] if isinstance(part, str) else list(part)
-        if not names:
-            raise ValueError("part: expected at least one name, got none")
-        for name in names:
-            self.part(name)
+        names = self._names(part)
         if isinstance(material, str):
             new, said = self._from_library(material), repr(material)
         elif callable(getattr(material, "eval", None)):
@@ -211,7 +568,7 @@ class EditSession:
                 f"got {material!r}"
             )
         target = repr(part if isinstance(part, str) else names)
-        self._do(dict.fromkeys(names, new), f"edit.assign({target}, {said})")
+        self._do(dict.fromkeys(names, new), _Said(f"edit.assign({target}, {said})"))
 
     def _from_reflectance(self, brdf: Reflectance) -> Material:
         grid = self.embedding.grid_
@@ -225,12 +582,12 @@ class EditSession:
         values = np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
         return Material(z, table.mirror, self.embedding.residual(table), values, name)
 
-    def move(self, part: str, hold: Iterable[str] = (), **amounts: float) -> None:
-        """Change traits of one part: ``edit.move("handle", shiny=0.6, hold=("colour",))``.
+    def move(self, part: str | Iterable[str], hold: Iterable[str] = (), **amounts: float) -> None:
+        """Change traits of parts: ``edit.move("handle", shiny=0.6, hold=("colour",))``.
 
         Parameters
         ----------
-        part : name
+        part : name or names of parts
         hold : traits, or the group "colour", whose scores shall stay
         amounts : for each trait, how much its score shall change (1: typically low to high)
 
@@ -242,14 +599,16 @@ class EditSession:
         """
         if not amounts:
             raise ValueError("amounts: expected at least one trait, as in shiny=0.6; got none")
+        names = self._names(part)
         hold = (hold,) if isinstance(hold, str) else tuple(hold)
-        new = self._moved(part, amounts, hold)
-        said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
-        held = f", hold={hold!r}" if hold else ""
-        self._do({part: new}, f"edit.move({part!r}{said}{held})")
+        with self._lock:
+            # parts of one material stay so: they are decoded once
+            moved = {m: self._moved(m, amounts, hold) for m in map(self.material, names)}
+            new = {name: moved[self.material(name)] for name in names}
+            target = part if isinstance(part, str) else names
+            self._do(new, _Said(_move_call(target, amounts, hold)))
 
-    def _moved(self, part: str, amounts: Mapping[str, float], hold: Iterable[str]) -> Material:
-        old = self.material(part)
+    def _moved(self, old: Material, amounts: Mapping[str, float], hold: Iterable[str]) -> Material:
         z = self.traits.move(old.z, amounts, hold)
         if np.array_equal(z, old.z):
             return old
@@ -274,172 +633,584 @@ class EditSession:
         if not isinstance(stroke, Stroke):
             raise TypeError(f"stroke: expected a Stroke, got {stroke!r}")
         self.traits.index(stroke.trait)
-        scene = self.scene
-        weights = region_weights(
-            stroke.coverage(scene.height, scene.width), scene.part_image, len(scene.parts)
-        )
-        touched = [
-            (name, float(weight))
-            for name, weight in zip(scene.parts, weights, strict=True)
-            if weight > 0.0
-        ]
-        if not touched:
-            raise ValueError(
-                "stroke: expected a stroke that touches the object, got one that lies beside it "
-                f"(image {scene.width} x {scene.height}, {len(stroke.points)} points)"
+        with self._lock:
+            scene = self.scene
+            weights = region_weights(
+                stroke.coverage(scene.height, scene.width), scene.part_image, len(scene.parts)
             )
-        hold = stroke.hold
-        if hold is None:
-            hold = () if stroke.trait in GROUPS["colour"] else ("colour",)
-        moved = {name: stroke.amount * weight for name, weight in touched}
-        new = {
-            name: self._moved(name, {stroke.trait: amount}, hold) for name, amount in moved.items()
-        }
-        held = "" if stroke.hold is None else f", hold={tuple(stroke.hold)!r}"
-        self._do(
-            new,
-            f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
-            f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}))",
-        )
+            moved = {
+                name: stroke.amount * float(weight)
+                for name, weight in zip(scene.parts, weights, strict=True)
+                if weight > 0.0
+            }
+            if not moved:
+                raise ValueError(
+                    "stroke: expected a stroke that touches the object, got one that lies beside "
+                    f"it (image {scene.width} x {scene.height}, {len(stroke.points)} points)"
+                )
+            hold = stroke.hold
+            if hold is None:
+                hold = () if stroke.trait in GROUPS["colour"] else ("colour",)
+            hold = tuple(hold)
+            new = {
+                name: self._moved(self.material(name), {stroke.trait: amount}, hold)
+                for name, amount in moved.items()
+            }
+            held = "" if stroke.hold is None else f", hold={hold!r}"
+            self._do(new, _Said(
+                f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
+                f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}))",
+                "; ".join(_move_call(name, {stroke.trait: a}, hold) for name, a in moved.items()),
+                _framing(scene),
+            ))  # fmt: skip
         return moved
 
-    def _do(self, new: dict[str, Material], call: str) -> None:
-        before = {part: self._materials[part] for part in new}
-        self._done.append(_Edit(before, new, call))
-        self._undone.clear()
-        self._materials.update(new)
+    def _do(self, new: dict[str, Material], said: _Said) -> None:
+        with self._lock:
+            before = {part: self._materials[part] for part in new}
+            self._done.append(_Edit(before, new, said))
+            self._undone.clear()
+            self._materials.update(new)
 
     def undo(self) -> bool:
         """Take the last edit back; False if there is none."""
-        if not self._done:
-            return False
-        edit = self._done.pop()
-        self._materials.update(edit.before)
-        self._undone.append(edit)
-        return True
+        with self._lock:
+            if not self._done:
+                return False
+            edit = self._done.pop()
+            self._materials.update(edit.before)
+            self._undone.append(edit)
+            return True
 
     def redo(self) -> bool:
         """Do the last undone edit again; False if there is none."""
-        if not self._undone:
-            return False
-        edit = self._undone.pop()
-        self._materials.update(edit.after)
-        self._done.append(edit)
-        return True
+        with self._lock:
+            if not self._undone:
+                return False
+            edit = self._undone.pop()
+            self._materials.update(edit.after)
+            self._done.append(edit)
+            return True
 
     @property
     def history(self) -> list[str]:
-        """The Python calls that made the design, in order; undone ones are not among them."""
-        return self._replayed + [edit.call for edit in self._done]
+        """The Python calls that made the design, in order; undone ones are not among them.
+
+        They replay it on this session's present scene: strokes that were painted on the image of
+        another camera or size appear as the moves that they were.
+        """
+        with self._lock:
+            framing = _framing(self.scene)
+            said = [*self._replayed, *(edit.said for edit in self._done)]
+            return [one.under(framing) for one in said]
+
+    # -- view and light -------------------------------------------------------------------------
+
+    def look(
+        self,
+        camera: Camera | None = None,
+        environment: EnvironmentMap | None = None,
+        lights: Sequence[Light] | None = None,
+        size: int | tuple[int, int] | None = None,
+        rotation: float | None = None,
+    ) -> None:
+        """Change the view or the light; what is None stays. Materials and undo stay as well.
+
+        A preparation that runs is cancelled; the next `render` prepares the new view.
+
+        Parameters
+        ----------
+        camera : Camera
+        environment : EnvironmentMap
+        lights : the point and directional lights, all of them
+        size : int or (height, width)
+        rotation : radians
+            Angle by which the map is turned about +y (`EnvironmentMap.rotation`).
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `Scene` does. Nothing is changed then.
+        """
+        with self._lock:
+            scene = self.scene
+            light = scene.environment if environment is None else environment
+            if not isinstance(light, EnvironmentMap):
+                raise TypeError(f"environment: expected an EnvironmentMap, got {light!r}")
+            if rotation is not None:
+                clipped = light.clipped_texels
+                light = EnvironmentMap(light.image, rotation)
+                light.clipped_texels = clipped
+            wanted: dict[str, Any] = {}
+            if light.image is not scene.environment.image or (
+                light.rotation != scene.environment.rotation
+            ):
+                wanted["environment"] = light
+            if camera is not None and camera != scene.camera:
+                wanted["camera"] = camera
+            if lights is not None and tuple(lights) != scene.lights:
+                wanted["lights"] = lights
+            if size is not None:
+                pair = tuple(size) if isinstance(size, (tuple, list)) else (size, size)
+                if pair != (scene.height, scene.width):
+                    wanted["size"] = size
+            if not wanted:
+                return
+            old, self._view = self._view, _View(scene.changed(**wanted))
+            if old.job is not None:
+                old.job.stop()
 
     # -- frames ---------------------------------------------------------------------------------
 
-    def prepare(self) -> Transport:
-        """Compress the scene's light transport, unless that is done already."""
-        if self._transport is None:
-            start = time.perf_counter()
-            rank, resolution = QUALITIES[self.quality]
-            self._transport = Transport(
-                self.scene,
-                self.embedding.grid_,
-                _training(self.library, self.seed),
-                rank=rank,
-                resolution=resolution,
-                seed=self.seed,
-                device=self.device,
-                progress=self._progress,
-            )
-            self._times["prepare"] = time.perf_counter() - start
-        return self._transport
+    @property
+    def ready(self) -> bool:
+        """Whether the present view is prepared: `render` then takes milliseconds."""
+        return self._view.transport is not None
 
-    def render(self) -> Float32:
+    @overload
+    def prepare(self, wait: Literal[True] = True) -> Transport: ...
+
+    @overload
+    def prepare(self, wait: bool) -> Transport | None: ...
+
+    def prepare(self, wait: bool = True) -> Transport | None:
+        """Compress the scene's light transport, unless that is done already.
+
+        Parameters
+        ----------
+        wait : bool
+            False starts the preparation in a thread behind, unless one runs, and returns at once.
+
+        Returns
+        -------
+        The prepared transport; None while it is not ready (only if `wait` is False).
+
+        Raises
+        ------
+        concurrent.futures.CancelledError
+            If it was cancelled by another thread while this one waited.
+        RuntimeError
+            If the `progress` callback waits for the preparation that called it.
+        Exception
+            What a preparation that ran behind failed with, once; the next call tries again.
+        """
+        while True:
+            with self._lock:
+                view, job = self._view, self._view.job
+                if view.transport is not None:
+                    return view.transport
+                fresh = job is None
+                if job is None:
+                    job = view.job = self._new_job(view)
+                elif job.error is not None:
+                    view.job = None
+            if fresh and not wait:
+                job.start()
+            elif fresh:
+                job.run()
+            if job.error is not None:
+                with self._lock:
+                    if view.job is job:
+                        view.job = None
+                raise job.error
+            if not wait:
+                return None
+            if job.thread is threading.current_thread() and not job.done.is_set():
+                raise RuntimeError("prepare: expected another thread than that of the preparation")
+            job.done.wait()
+            if job.stopped and self._view is view and view.transport is None:
+                raise CancelledError("the preparation was cancelled")
+
+    def _new_job(self, view: _View) -> _Preparation:
+        # neither of these holds the session: a session that nobody needs any more can go
+        lock = self._lock
+
+        def publish(job: _Preparation, transport: Transport, cached: bool) -> None:
+            with lock:
+                if view.transport is None:
+                    view.transport, view.cached = transport, cached
+                    view.times["prepare"] = job.seconds
+                if view.job is job:
+                    view.job = None
+
+        work = functools.partial(
+            _prepare, view.scene, self.library, self.quality, self.seed, self.device, self._cache
+        )
+        return _Preparation(work, publish, self._progress, weakref.ref(self))
+
+    def cancel(self) -> None:
+        """Stop a preparation that runs, soon; the session goes on as if it had not begun."""
+        with self._lock:
+            job = self._view.job
+            if job is not None and not job.done.is_set():
+                self._view.job = None
+                job.stop()
+
+    def draft(self) -> tuple[Float32, float]:
+        """A first image at once, without any preparation.
+
+        It is rendered at 128 pixels along the longer side and enlarged; the first one of a view
+        takes longer than those after it.
+
+        Returns
+        -------
+        image : (H, W, 3) float32 linear radiance, backdrop included
+        error : float
+            Mean relative L1 over the small image's covered pixels, measured at some of them.
+        """
+        while True:
+            with self._lock:
+                view = self._view
+                scene = view.scene
+                materials = tuple(self._materials[part] for part in scene.parts)
+            known = view.drafted
+            if known is None or any(a is not b for a, b in zip(known[0], materials, strict=True)):
+                with _TURNS.urgent():
+                    known = view.drafted = self._draft(view, materials)
+            if view is self._view:  # else it is a picture of what was looked at before
+                return _enlarged(known[1], scene.height, scene.width), known[2]
+
+    def _draft(
+        self, view: _View, materials: tuple[Material, ...]
+    ) -> tuple[tuple[Material, ...], Float32, float]:
+        start = time.perf_counter()
+        if view.draft is None:
+            tree = self._trees.of(view.scene.environment)
+            grid = self.embedding.grid_
+            view.draft = Draft(view.scene, grid, DRAFT_SIZE, tree=tree, seed=self.seed)
+        tables = {m: m.values(self.embedding) for m in materials}
+        image, error = view.draft.render(
+            [tables[m] for m in materials], [m.mirror for m in materials]
+        )
+        view.times["draft"] = time.perf_counter() - start
+        return materials, image, error
+
+    def render(self, wait: bool = True) -> Float32:
         """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.
 
-        Parts whose material is the same object as at the last frame are not computed again.
-        """
-        transport = self.prepare()
-        start = time.perf_counter()
-        frames = [self._shade(transport, i, part) for i, part in enumerate(self.scene.parts)]
-        image = transport.compose(frames)
-        result = np.asarray(image.cpu().numpy(), np.float32)
-        self._times["frame"] = time.perf_counter() - start
-        return result
+        Parts whose material is the same object as at a recent frame are not computed again, and
+        only the pixels of those that changed are drawn. The array is the caller's.
 
-    def _shade(self, transport: Transport, index: int, part: str) -> PartFrame:
-        material = self._materials[part]
-        known = self._frames.get(part)
-        if known is not None and known[0] is material:
-            return known[1]
+        Parameters
+        ----------
+        wait : bool
+            False returns the draft while the view is not prepared, and has it prepared behind.
+
+        Raises
+        ------
+        As `prepare` does.
+        """
+        while not wait:
+            with self._lock:
+                view = self._view
+                if view.transport is not None:
+                    return self._frame(view, view.transport)
+            image, _ = self.draft()
+            if self.prepare(wait=False) is None:
+                return image
+        with self._prepared() as (view, transport):
+            return self._frame(view, transport)
+
+    def frames(self) -> Iterator[tuple[Float32, float, float]]:
+        """Images that get better: the draft, then the finished frame.
+
+        Yields (image, error, fraction): the image and its error as `draft` has them, again
+        whenever the preparation has come on or a material has changed; at last the frame and its
+        measured error, with a fraction of 1. Closing the generator cancels the preparation, and
+        cancelling the preparation ends the generator.
+
+        Examples
+        --------
+        >>> for image, error, fraction in edit.frames():  # doctest: +SKIP
+        ...     show(image, f"{fraction:.0%}, error {error:.2%}")
+        """
+        view, job = self._view, None
+        try:
+            while not self.ready:
+                image, error = self.draft()
+                yield image, error, 0.0 if job is None else job.fraction
+                with self._lock:
+                    if self._view is not view:  # what was begun for the old view is void
+                        view, job = self._view, None
+                    if job is not None and job.stopped:
+                        return
+                    self.prepare(wait=False)
+                    job = view.job or job
+                if job is not None:
+                    job.done.wait(_TICK)
+            with self._prepared() as (view, transport):
+                image, error = self._frame(view, transport), _measured(view, transport)
+            yield image, error, 1.0
+        finally:
+            if not self.ready:
+                self.cancel()
+
+    @contextlib.contextmanager
+    def _prepared(self) -> Iterator[tuple[_View, Transport]]:
+        """The lock, held once the present view is ready: never while it is waited for."""
+        while True:
+            self.prepare()
+            with self._lock:
+                view = self._view
+                if view.transport is not None:
+                    yield view, view.transport
+                    return
+
+    def _frame(self, view: _View, transport: Transport) -> Float32:
+        start = time.perf_counter()
+        tables: dict[Material, torch.Tensor] = {}
+        shown = [
+            self._shade(view, transport, i, self._materials[part], tables)
+            for i, part in enumerate(view.scene.parts)
+        ]
+        if view.canvas is None:
+            view.canvas = _Canvas(transport)
+        view.canvas.draw([one.frame for one in shown])
+        view.shown = shown
+        image = view.canvas.image()
+        view.times["frame"] = time.perf_counter() - start
+        return image
+
+    def _shade(
+        self,
+        view: _View,
+        transport: Transport,
+        index: int,
+        material: Material,
+        tables: dict[Material, torch.Tensor],
+    ) -> _Shown:
+        """One part's shading; `tables` holds what was decoded for this frame."""
+        known = view.kept.get((index, material))
+        if known is not None:
+            view.kept.move_to_end((index, material))
+            return known
+        start = time.perf_counter()
+        if material not in tables:
+            values = material.values(self.embedding, transport.cells)
+            tables[material] = torch.from_numpy(values).to(self.device)
+        mirror = None
+        if material.mirror.any():
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
+        frame = transport.shade(index, tables[material], mirror)
+        tier: Literal["basis", "trained", "exact"] = "basis"
+        if view.trained.get(index):
+            tier = "trained"
+        if frame.error > self._allowed(view, index):
+            frame, tier = self._exactly(view, transport, index, material, mirror), "exact"
+            tables.clear()  # the transport may see other cells by now
+        shown = _Shown(frame, tier, time.perf_counter() - start)
+        view.keep(index, material, shown)
+        return shown
+
+    def _allowed(self, view: _View, index: int) -> float:
+        """The measured error up to which a part is shown by the basis."""
+        if self.error is not None:
+            return TRUSTED * self.error
+        # if nothing is asked for, nothing is gained by exact frames that err as much
+        return max(TRUSTED * EXACT_ABOVE, view.floor.get(index, 0.0))
+
+    def _exactly(
+        self,
+        view: _View,
+        transport: Transport,
+        index: int,
+        material: Material,
+        mirror: torch.Tensor | None,
+    ) -> PartFrame:
+        """A part without the basis; its image is taken into the basis for the edits to come."""
         values = material.values(self.embedding)
-        mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
-        cells = torch.from_numpy(values[transport.cells]).to(self.device)
-        frame, tier = transport.shade(index, cells, mirror), "basis"
-        if frame.error > (EXACT_ABOVE if self.error is None else self.error):
-            frame, tier = transport.shade_exactly(index, values, mirror), "exact"
-        self._frames[part] = material, frame, tier
-        return frame
+        with _TURNS.urgent():
+            frame = transport.shade_exactly(index, values)
+            if frame.error > TRUSTED * EXACT_ABOVE:
+                view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
+            allowed = self._allowed(view, index)
+            budget = view.budget.get(index, TRAINED_IMAGES)
+            # where even exact frames miss the error asked for, the basis cannot meet it
+            if budget > 0 and frame.error <= allowed:
+                transport.train(index, frame.radiance)
+                table = torch.from_numpy(values[transport.cells]).to(self.device)
+                met = transport.shade(index, table).error <= allowed
+                view.trained[index] = view.trained.get(index, 0) + 1
+                # each image makes all frames slower: few of those that do not help
+                view.budget[index] = budget - (1 if met else TRAINED_IMAGES // 2)
+        view.exact_frames += 1
+        part = transport.parts[index]
+        if mirror is None or part is None:
+            return frame
+        return replace(frame, radiance=frame.radiance + mirror * part.mirror)
+
+    # -- gradients ------------------------------------------------------------------------------
+
+    def radiance(self, part: str, z: torch.Tensor) -> torch.Tensor:
+        """A part's linear radiance as a differentiable function of coordinates.
+
+        Parameters
+        ----------
+        part : name
+        z : (k,) tensor, float32 or float64
+
+        Returns
+        -------
+        (P, 3) float32 tensor on the session's device: what the part would add to its pixels (see
+        `gradient` for which) if its coordinates were `z`, by the basis and not clamped at 0. What
+        an assigned table has beyond the manifold, and a mirror beside it, stay.
+        """
+        index, material = self.part(part), self.material(part)
+        with self._prepared() as (_, transport):
+            table = self.embedding.decode_tensor(z, material.offset, transport.cells)
+            shown = transport.radiance(index, table.to(self.device, torch.float32))
+            known = transport.parts[index]
+            if known is None or not material.mirror.any():
+                return shown
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
+            return shown + mirror * known.mirror
+
+    def gradient(self, part: str) -> tuple[Int64, Float32]:
+        """Derivative of the linear frame by a part's coordinates, in closed form.
+
+        Returns
+        -------
+        pixels : (P,) int64
+            Flat indices (row * width + column) of the pixels that show the part.
+        slopes : (P, 3, k) float32
+            d radiance / d z of each pixel and colour: of what `radiance` gives at the part's
+            present coordinates.
+        """
+        index, material = self.part(part), self.material(part)
+        with self._prepared() as (view, transport):
+            slopes = self.embedding.jacobian(material.z, material.offset, transport.cells)
+            columns = torch.from_numpy(slopes).to(self.device).permute(2, 0, 1)
+            # radiance is linear in the table: all coordinates in one product
+            moved = torch.vmap(lambda table: transport.radiance(index, table))(columns)
+            pixels = view.scene.pixels[view.scene.part_slice(index)].copy()
+        return pixels, moved.permute(1, 2, 0).contiguous().cpu().numpy()
+
+    # -- reports --------------------------------------------------------------------------------
 
     def report(self) -> dict[str, Any]:
         """What was measured: error, tier, times, sizes, plausibility; JSON serialisable.
 
         ``frame_error`` is the mean relative L1 on the probe pixels, which keep their exact
-        rows, over the whole object; ``parts`` has it part by part, with the tier ("basis" or
-        "exact"), the trait scores of its coordinates, ``energy_scale`` (the factor by which the
-        table had to be lowered to reflect no more than all light: below 1 it shows less of its
-        traits than the scores say), the largest directional albedo and how far the coordinates
-        lie inside the gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts).
+        rows, over all covered pixels; ``parts`` has it part by part, with the tier, the trait
+        scores of its coordinates, ``energy_scale`` (the factor by which the table had to be
+        lowered to reflect no more than all light: below 1 it shows less of its traits than the
+        scores say), the largest directional albedo and how far the coordinates lie inside the
+        gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts).
+
+        Tiers: "basis"; "trained", the same after exact images were taken into the part's basis;
+        "exact", without the basis. ``exact_frames`` counts those, ``trained_images`` what the
+        bases have taken in.
+
+        ``left_out`` is what the frame did not need, and what that saved where it is measured: here
+        and now, both ways. A frame is rendered (and the scene prepared) if that is to be done.
         """
-        if self._transport is None or len(self._frames) < len(self.scene.parts):
-            self.render()
-        transport = self.prepare()
-        parts = {}
-        span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
-        for i, part in enumerate(self.scene.parts):
-            material = self._materials[part]
-            frame = self._shade(transport, i, part)
-            inside = (material.z - self.embedding.low_) / span
-            parts[part] = {
-                "material": material.name,
-                "pixels": len(frame.radiance),
-                "error": frame.error,
-                "tier": self._frames[part][2],
-                "scores": self.traits.score(material.z),
-                "energy_scale": self._energy_scale(material),
-                "max_albedo": self.brdf(part).max_albedo(),
-                "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
+        with self._prepared() as (view, transport):
+            materials = [self._materials[part] for part in view.scene.parts]
+            fresh = len(view.shown) < len(materials) or any(
+                view.kept.get((i, m)) is not view.shown[i] for i, m in enumerate(materials)
+            )
+            if fresh:
+                self._frame(view, transport)
+            scene = view.scene
+            parts = {}
+            for i, (part, material) in enumerate(zip(scene.parts, materials, strict=True)):
+                parts[part] = self._part_report(part, material, view.shown[i])
+            return {
+                "quality": self.quality,
+                "frame_error": _measured(view, transport),
+                "error_asked": EXACT_ABOVE if self.error is None else self.error,
+                "seconds": dict(view.times),
+                "prepared_from": "cache" if view.cached else "scratch",
+                "image": [scene.height, scene.width],
+                "covered_pixels": int(np.count_nonzero(scene.uncovered < 1.0)),
+                "fragments": len(scene.pixels),
+                "basis_images": transport.rank,
+                "exact_frames": view.exact_frames,
+                "trained_images": {scene.parts[i]: n for i, n in view.trained.items()},
+                "cells_seen": len(transport.cells),
+                "cells": self.embedding.grid_.size,
+                "bytes": transport.bytes,
+                "device": str(self.device),
+                "clipped_texels": scene.environment.clipped_texels,
+                "left_out": self._left_out(view, transport),
+                "parts": parts,
+                "history": self.history,
             }
-        frames = [self._frames[part][1] for part in self.scene.parts]
+
+    def _part_report(self, part: str, material: Material, shown: _Shown) -> dict[str, Any]:
+        span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
+        inside = (material.z - self.embedding.low_) / span
         return {
-            "quality": self.quality,
-            "frame_error": transport.frame_error(frames),
-            "seconds": dict(self._times),
-            "image": [self.scene.height, self.scene.width],
-            "covered_pixels": len(self.scene.pixels),
-            "basis_images": transport.rank,
-            "cells_seen": len(transport.cells),
-            "cells": self.embedding.grid_.size,
-            "bytes": transport.bytes,
-            "device": str(self.device),
-            "clipped_texels": self.scene.environment.clipped_texels,
-            "parts": parts,
-            "history": self.history,
+            "material": material.name,
+            "pixels": len(shown.frame.radiance),
+            "error": shown.frame.error,
+            "tier": shown.tier,
+            "scores": self.traits.score(material.z),
+            "energy_scale": self._energy_scale(material),
+            "max_albedo": self.brdf(part).max_albedo(),
+            "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
+        }
+
+    def _left_out(self, view: _View, transport: Transport) -> dict[str, Any]:
+        """What the last frame did without."""
+        scene, canvas = view.scene, view.canvas
+        if canvas is None:
+            return {}
+        frames = [one.frame for one in view.shown]
+        changed = canvas.changed
+        z = self._materials[scene.parts[0]].z
+        decode = self.embedding.decode_values
+        drawn = [scene.pixels[scene.part_slice(i)] for i in changed]
+        still = [i for i in range(len(scene.parts)) if i not in changed]
+        return {
+            "shadow_rays": {
+                "parts": [
+                    part
+                    for part, casts in zip(scene.parts, scene.casts, strict=True)
+                    if scene.shadows and not casts
+                ],
+                "rays_cast": scene.rays_cast,
+            },
+            "cells": {
+                "seen": len(transport.cells),
+                "of": self.embedding.grid_.size,
+                "seconds": _timed(lambda: decode(z, None, transport.cells), self.device),
+                "seconds_for_all": _timed(lambda: decode(z), self.device),
+            },
+            "channels": {"computed": 1 if transport.grey else 3, "of": 3},
+            "parts_not_edited": {
+                "parts": [scene.parts[i] for i in still],
+                "seconds_saved": sum(view.shown[i].seconds for i in still),
+            },
+            "pixels": {
+                "redrawn": len(np.unique(np.concatenate(drawn))) if drawn else 0,
+                "of": scene.height * scene.width,
+                "seconds": _timed(lambda: canvas.redraw(changed, frames), self.device),
+                "seconds_for_all": _timed(lambda: transport.compose(frames), self.device),
+            },
         }
 
     # -- files ----------------------------------------------------------------------------------
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the design (scene, light, materials, history) to one file; atomic.
+        """Write the design (present view and light, materials, history) to one file; atomic.
 
-        The file holds arrays and JSON only; a loaded design renders the identical frame. What was
-        undone is not kept.
+        The file holds arrays and JSON only. A loaded design renders the same frame: bit by bit
+        where the parts are shown by the basis as prepared or exactly, within the error asked for
+        where the basis was trained meanwhile. What was undone is not kept.
         """
-        scene = self.scene
+        with self._lock:
+            scene = self.scene
+            materials = dict(self._materials)
+            framing = _framing(scene)
+            said = [*self._replayed, *(edit.said for edit in self._done)]
         arrays: dict[str, NDArray[Any]] = {"environment": scene.environment.image}
         if isinstance(scene.shape, Mesh):
             mesh = scene.shape
             shape: dict[str, Any] = {"kind": "mesh", "parts": list(mesh.parts)}
-            for name in ("vertices", "faces", "normals", "face_part"):
-                arrays[f"shape_{name}"] = np.asarray(getattr(mesh, name))
+            for name in ("vertices", "faces", "normals", "face_part", "uvs"):
+                if getattr(mesh, name) is not None:
+                    arrays[f"shape_{name}"] = np.asarray(getattr(mesh, name))
         elif isinstance(scene.shape, Sphere):
             shape = {
                 "kind": "sphere",
@@ -448,26 +1219,31 @@ class EditSession:
             }
         else:
             raise TypeError(f"save: expected a sphere or a mesh, got {scene.shape!r}")
-        materials = []
+        named = []
         for i, part in enumerate(scene.parts):
-            material = self._materials[part]
+            material = materials[part]
             arrays[f"z_{i}"], arrays[f"mirror_{i}"] = material.z, material.mirror
             for name in ("offset", "table"):
                 value = getattr(material, name)
                 if value is not None:
                     arrays[f"{name}_{i}"] = value
-            materials.append({"part": part, "name": material.name})
+            named.append({"part": part, "name": material.name})
         header = {
             "format": _FORMAT,
             "embedding": _fingerprint(self.embedding),
             "shape": shape,
+            "ground": scene.ground,
+            "shadows": scene.shadows,
+            "subsamples": scene.subsamples,
             "size": [scene.height, scene.width],
             "camera": vars(scene.camera),
             "rotation": scene.environment.rotation,
             "clipped_texels": scene.environment.clipped_texels,
             "lights": [{"kind": type(light).__name__, **vars(light)} for light in scene.lights],
-            "materials": materials,
-            "history": self.history,
+            "materials": named,
+            "history": [one.under(framing) for one in said],
+            # what the strokes among them are where the picture is framed otherwise
+            "anywhere": [one.anywhere if one.framing == framing else "" for one in said],
             "quality": self.quality,
             "error": self.error,
             "seed": self.seed,
@@ -479,6 +1255,9 @@ class EditSession:
     def load(cls, path: str | PathLike[str], **settings: Any) -> EditSession:
         """Read a design written by `save`; `settings` are passed to `EditSession`.
 
+        Designs of format 1, before there were shadows, load as they were: without shadows and
+        ground, one ray a pixel.
+
         Raises
         ------
         FileNotFoundError, traitbrdf.formats.FormatError
@@ -488,11 +1267,16 @@ class EditSession:
         arrays = read_arrays(path)
         with _design_errors(path):
             header = json.loads(str(arrays["design"]))
-            if header["format"] != _FORMAT:
-                raise FormatError(path, f"a design of format {_FORMAT}", f"{header['format']!r}")
+            if header["format"] == 1:
+                header = {**header, **_BEFORE_SHADOWS, "anywhere": [""] * len(header["history"])}
+            elif header["format"] != _FORMAT:
+                raise FormatError(
+                    path, f"a design of format 1 to {_FORMAT}", f"{header['format']!r}"
+                )
             scene = _saved_scene(header, arrays)
             given = {key: header[key] for key in ("quality", "error", "seed")}
-            cls(scene, **given)  # what is wrong in the file is no mistake of the caller
+            # what is wrong in the file is no mistake of the caller
+            cls(scene, **given, cache=False)
         session = cls(scene, **{**given, **settings})
         with _design_errors(path):
             expected = _fingerprint(session.embedding)
@@ -507,7 +1291,10 @@ class EditSession:
                 session._materials[entry["part"]] = _saved_material(
                     i, str(entry["name"]), arrays, session.embedding
                 )
-            session._replayed = [str(call) for call in header["history"]]
+            session._replayed = [
+                _Said(str(call), str(anywhere), _framing(scene))
+                for call, anywhere in zip(header["history"], header["anywhere"], strict=True)
+            ]
         return session
 
 
@@ -524,6 +1311,9 @@ def _design_errors(path: str | PathLike[str]) -> Iterator[None]:
         raise FormatError(path, "a design written by EditSession.save", repr(error)) from error
 
 
+_BEFORE_SHADOWS = {"ground": False, "shadows": False, "subsamples": 1}
+
+
 def _saved_scene(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Scene:
     shape = header["shape"]
     made: Mesh | Sphere
@@ -531,7 +1321,8 @@ def _saved_scene(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> 
         vertices, faces, normals, face_part = (
             arrays[f"shape_{name}"] for name in ("vertices", "faces", "normals", "face_part")
         )
-        made = Mesh(vertices, faces, normals, face_part, tuple(shape["parts"]))
+        uvs = arrays.get("shape_uvs")
+        made = Mesh(vertices, faces, normals, face_part, tuple(shape["parts"]), uvs)
     else:
         made = sphere(shape["radius"], shape["center"])
     lights: list[Light] = []
@@ -546,7 +1337,10 @@ def _saved_scene(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> 
     environment = EnvironmentMap(arrays["environment"], header["rotation"])
     environment.clipped_texels = int(header["clipped_texels"])
     height, width = header["size"]
-    return Scene(made, environment, lights, Camera(**header["camera"]), (height, width))
+    return Scene(
+        made, environment, lights, Camera(**header["camera"]), (height, width),
+        ground=header["ground"], shadows=header["shadows"], subsamples=header["subsamples"],
+    )  # fmt: skip
 
 
 def _saved_material(
@@ -570,6 +1364,77 @@ def _saved_material(
     )
 
 
+def _measured(view: _View, transport: Transport) -> float:
+    """Error of the frame that was shown last."""
+    return transport.frame_error([one.frame for one in view.shown])
+
+
+def _framing(scene: Scene) -> tuple[Camera, int, int]:
+    """Where on the image things lie."""
+    return scene.camera, scene.height, scene.width
+
+
+def _move_call(part: str | list[str], amounts: Mapping[str, float], hold: tuple[str, ...]) -> str:
+    said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
+    held = f", hold={hold!r}" if hold else ""
+    return f"edit.move({part!r}{said}{held})"
+
+
+def _enlarged(image: Float32, height: int, width: int) -> Float32:
+    """A copy of an image (h, w, 3) at another size, bilinear between pixel centres."""
+    if image.shape[:2] == (height, width):
+        return image.copy()
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
+    whole = torch.nn.functional.interpolate(planes, (height, width), mode="bilinear")
+    return whole[0].permute(1, 2, 0).contiguous().numpy()
+
+
+def _timed(call: Callable[[], object], device: torch.device) -> float:
+    """Seconds that a call takes: the least of three."""
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+# -- preparation ----------------------------------------------------------------------------------
+
+
+def _prepare(
+    scene: Scene,
+    library: Library,
+    quality: str,
+    seed: int,
+    device: torch.device,
+    cache: _Cache | None,
+    report: Progress,
+) -> tuple[Transport, bool]:
+    """The transport of a scene, and whether it came from the cache."""
+    rank, resolution = QUALITIES[quality]
+    grid = library.embedding.grid_
+    key = None if cache is None else _cache_key(scene, library, rank, resolution, seed)
+    if cache is not None and key is not None:
+        arrays = cache.read(key)
+        if arrays is not None:
+            try:
+                transport = Transport.restored(scene, grid, arrays, device)
+            except ValueError:  # written by something else
+                cache.drop(key)
+            else:
+                report("reading", 1.0)
+                return transport, True
+    report("tables", 0.0)
+    training = _training(library, seed)
+    transport = Transport(scene, grid, training, rank, resolution, seed, device, report)
+    if cache is not None and key is not None:
+        cache.write_behind(key, transport.arrays())
+    return transport, False
+
+
 @functools.lru_cache(maxsize=1)
 def _training(library: Library, seed: int) -> Training:
     """The training set of a library; kept, since every new view or light needs it again."""
@@ -583,3 +1448,142 @@ def _fingerprint(embedding: BRDFEmbedding) -> str:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(value).tobytes())
     return digest.hexdigest()[:16]
+
+
+def _hash(*values: object) -> str:
+    """SHA-256 of arrays and of what has a faithful repr."""
+    digest = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            digest.update(f"{value.dtype}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).data)
+        else:
+            digest.update(repr(value).encode())
+    return digest.hexdigest()
+
+
+@functools.lru_cache(maxsize=1)
+def _code() -> str:
+    """A name of what computes: a result must not outlive the code that it came from."""
+    try:
+        version = importlib.metadata.version("traitbrdf")
+    except importlib.metadata.PackageNotFoundError:
+        version = ""
+    files = sorted(resources.files("traitbrdf").iterdir(), key=lambda file: file.name)
+    return _hash(version, *(file.read_bytes() for file in files if file.name.endswith(".py")))
+
+
+def _cache_key(
+    scene: Scene, library: Library, rank: int, resolution: float, seed: int
+) -> str | None:
+    """A name of all that a preparation depends on; None where that cannot be told."""
+    shape = scene.shape
+    geometry: tuple[object, ...]
+    if type(shape) is Mesh:
+        geometry = shape.vertices, shape.faces
+    elif type(shape) is Sphere or not any(scene.casts):
+        geometry = ()
+    else:
+        return None  # what casts shadows is known to the shape alone
+    return _hash(
+        _CACHE_FORMAT, _code(), _fingerprint(library.embedding), library.coordinates,
+        rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
+        scene.ground, scene.shadows, np.asarray(shape.center), shape.radius, shape.lowest,
+        *geometry, scene.environment.image, scene.environment.rotation, scene.lights,
+        *(getattr(scene, name) for name in _FRAGMENTS),
+        # a mesh that was saved and loaded may differ in the last bit
+        *(getattr(scene, name).astype(np.float32) for name in _SAMPLES),
+    )  # fmt: skip
+
+
+_FRAGMENTS = ("pixels", "pixel_part", "weights", "bordering", "offsets")
+_SAMPLES = ("normals", "views", "positions", "starts")
+
+
+class _Cache:
+    """Finished preparations on disk. A disk that is full, read-only or gone costs nothing but time.
+
+    Parameters
+    ----------
+    folder : where the files lie; made when the first is written
+    limit : bytes that they may take
+    """
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self.folder = folder
+        self.limit = limit
+
+    @classmethod
+    def usual(cls) -> _Cache | None:
+        """The one that the environment variables describe; None where there is none."""
+        said = os.environ.get("TRAITBRDF_CACHE_BYTES", str(CACHE_BYTES))
+        try:
+            limit = int(said)
+        except ValueError:
+            limit = -1
+        if limit < 0:
+            raise ValueError(f"TRAITBRDF_CACHE_BYTES: expected a number of bytes, got {said!r}")
+        if limit == 0:
+            return None
+        chosen = os.environ.get("TRAITBRDF_CACHE")
+        if chosen:
+            return cls(Path(chosen), limit)
+        standard = os.environ.get("XDG_CACHE_HOME", "")
+        if Path(standard).is_absolute():  # as its specification has it, others are ignored
+            return cls(Path(standard) / "traitbrdf", limit)
+        try:
+            return cls(Path.home() / ".cache" / "traitbrdf", limit)
+        except RuntimeError:  # a user without a home
+            return None
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.npz"
+
+    def read(self, key: str) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a key; None where there are none, or none that are whole."""
+        path = self._file(key)
+        try:
+            arrays = read_arrays(path)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, RuntimeError, MemoryError):  # damaged in whatever way
+            self.drop(key)
+            return None
+        with contextlib.suppress(OSError):  # a cache that is only read
+            os.utime(path)
+        return arrays
+
+    def drop(self, key: str) -> None:
+        with contextlib.suppress(OSError):
+            self._file(key).unlink(missing_ok=True)
+
+    def write_behind(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write in a thread of its own, so that the first frame need not wait.
+
+        The interpreter's end waits for it: a program that shows one frame would else never fill
+        the cache.
+        """
+        thread = threading.Thread(target=self.write, args=(key, arrays), name="traitbrdf-cache")
+        with contextlib.suppress(RuntimeError):  # the interpreter is ending
+            thread.start()
+
+    def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write the arrays, and remove the least recently used files beyond the limit."""
+        if sum(a.nbytes for a in arrays.values()) > self.limit:
+            return
+        with contextlib.suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with atomic_path(self._file(key)) as temporary, temporary.open("wb") as file:
+                # compressing takes as long as preparing anew
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            self._trim()
+
+    def _trim(self) -> None:
+        """What a cut-off process left half written goes like all others: by its age."""
+        found = [(path.stat(), path) for path in self.folder.glob("*.npz")]
+        total = sum(stat.st_size for stat, _ in found)
+        for stat, path in sorted(found, key=lambda pair: pair[0].st_mtime_ns):
+            if total <= self.limit:
+                return
+            path.unlink(missing_ok=True)
+            total -= stat.st_size

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, Reflectance, TabulatedBRDF, albedo_operator
@@ -38,6 +39,49 @@ _OPPONENT = np.array(
     ]
 )
 """Orthonormal rows: mean of the channels, red against blue, green against magenta."""
+
+_CAP = 30.0
+"""Where log(f + FLOOR) ends: no BRDF reaches 1e13, and exp must not overflow."""
+
+_MARGIN = 1.0 + 1e-6
+"""What scaled tables stay below albedo 1 by, so that rounding does not lift them above it."""
+
+_TIE = 1e-6
+"""Relative distance at which two albedos count as equal: the channels of a grey material."""
+
+
+class _Rows(NamedTuple):
+    """The basis at some cells, as arrays or as tensors; colours first, which is the faster way.
+
+    index : (n,) flat cell indices, or slice(None)
+    basis : (m, n)
+    mean : (n,)
+    """
+
+    index: Any
+    basis: Any
+    mean: Any
+
+    def logs(self, scores: Any, offset: Any) -> Any:
+        """log(f + FLOOR) (3, n) of channel scores (3, m), with an offset (cells, 3) or None."""
+        logs = scores @ self.basis
+        logs += self.mean
+        if offset is not None:
+            whole = isinstance(self.index, slice) or isinstance(offset, torch.Tensor)
+            # numpy's take of rows is ten times as fast as its indexing
+            logs += (offset[self.index] if whole else offset.take(self.index, axis=0)).T
+        return logs
+
+
+class _Tensors(NamedTuple):
+    """What `BRDFEmbedding.decode_tensor` needs, on one device and in one precision."""
+
+    every: _Rows
+    checked: _Rows
+    check: torch.Tensor
+    low: torch.Tensor
+    high: torch.Tensor
+    opponent: torch.Tensor
 
 
 class BRDFEmbedding:
@@ -117,6 +161,16 @@ class BRDFEmbedding:
         self._gram = weighted.T @ weighted
         self._project = np.linalg.solve(self._gram, (weighted * self.weight_[:, None]).T)
         self._albedo = albedo_operator(self.grid_, ALBEDO_ANGLES).astype(np.float32)
+        # the energy check by itself, for when only some cells are decoded: three quarters of the
+        # grid, so a dense product is faster than the sparse one
+        checked = np.unique(self._albedo.indices)
+        self._check: Float32 = np.ascontiguousarray(self._albedo[:, checked].toarray().T)
+        self._every = _Rows(slice(None), np.ascontiguousarray(self.components_.T), self.mean_)
+        self._checked = _Rows(
+            checked, np.ascontiguousarray(self.components_[checked].T), self.mean_[checked]
+        )
+        self._fan = np.kron(_OPPONENT.T.reshape(1, 9), np.eye(self.n_components)).astype(np.float32)
+        self._tensors: dict[tuple[torch.device, torch.dtype], _Tensors] = {}
 
     def __repr__(self) -> str:
         state = f", k={self.size}, grid={self.grid_.shape}" if hasattr(self, "grid_") else ""
@@ -214,16 +268,33 @@ class BRDFEmbedding:
         """The nearest point (k,) in the gamut box."""
         return np.clip(self.as_coordinates(z), self.low_, self.high_)
 
-    def decode_values(self, z: ArrayLike, offset: Float32 | None = None) -> Float32:
-        """f_r (cells, 3) at all cells of the grid, float32: positive and with albedo <= 1.
+    def decode_values(
+        self, z: ArrayLike, offset: Float32 | None = None, cells: ArrayLike | None = None
+    ) -> Float32:
+        """f_r (n, 3) in 1/sr at cells of the grid, float32: positive and with albedo <= 1.
 
         `z` is clipped to the gamut box; where the directional albedo of any colour at any of the
-        16 check angles exceeds 1, all colours are divided by it. `offset` (cells, 3) is added to
-        log(f + FLOOR): what a given table has beyond the manifold.
+        16 check angles exceeds 1, all colours are divided by it.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+        offset : (cells, 3) float32, optional
+            Added to log(f + FLOOR): what a given table has beyond the manifold. Always for the
+            whole grid.
+        cells : (n,) integers, optional
+            Flat indices of the cells to decode, in any order; all of them if left out. The
+            energy check reads the cells that it needs (three quarters of the grid) in either
+            case, so values are those of the whole table, to float32 rounding.
+
+        Raises
+        ------
+        ValueError
+            On a wrong shape, coordinates that are not finite, or an index outside the grid.
         """
-        values, albedo = self._decode(z, offset)
+        values, albedo = self._decode(z, offset, cells)
         if albedo > 1.0:
-            values /= np.float32(albedo * (1.0 + 1e-6))
+            values /= np.float32(albedo * _MARGIN)
         return values
 
     def energy_scale(self, z: ArrayLike, offset: Float32 | None = None) -> float:
@@ -234,20 +305,175 @@ class BRDFEmbedding:
         """
         return min(1.0, 1.0 / max(self._decode(z, offset)[1], 1e-30))
 
-    def _decode(self, z: ArrayLike, offset: Float32 | None) -> tuple[Float32, float]:
-        """f (cells, 3) before its energy is checked, and its greatest directional albedo."""
-        scores = (_OPPONENT.T @ self.clip(z).reshape(3, -1)).T.astype(np.float32)
-        logs: Float32 = self.components_ @ scores
-        logs += self.mean_[:, None]
+    def jacobian(
+        self, z: ArrayLike, offset: Float32 | None = None, cells: ArrayLike | None = None
+    ) -> Float32:
+        """d f / d z (n, 3, k) in 1/sr, float32, of what `decode_values` returns at `cells`.
+
+        In closed form, with the slope of the energy scaling where that is active.
+
+        Parameters
+        ----------
+        z, offset, cells
+            As for `decode_values`.
+
+        Notes
+        -----
+        `decode_values` has kinks; there the slope is that of one side or of the mean:
+
+        - A coordinate outside the gamut box moves nothing (`z` is clipped): its column is 0. On
+          the face of the box the column is the slope towards the inside.
+        - Where f before the energy scaling is held at 0, or at the cap of 1e13, that has slope
+          0; exactly on these kinks, the slope of the side on which it moves.
+        - The energy scaling follows the greatest albedo. Where several are greatest to 1e-6
+          (the three colours of a grey material) it is the mean of their slopes, so that no
+          colour is favoured. Where the greatest is exactly 1, f counts as not scaled.
+
+        Raises
+        ------
+        ValueError
+            On a wrong shape, coordinates that are not finite, or an index outside the grid.
+        """
+        point = self.as_coordinates(z)
+        clipped = self.clip(point)
+        self._check_offset(offset)
+        rows = self._rows(cells)
+        scores = _channel_scores(_OPPONENT, clipped).astype(np.float32)
+        logs = rows.logs(scores, offset)
+        albedo = self._check_albedos(scores, offset)
+        greatest = float(albedo.max())
+        scale = 1.0 / (greatest * _MARGIN) if greatest > 1.0 else 1.0
+        # d log(f + FLOOR) of colour c, coordinate (axis a, component m) is opponent[a, c] basis[m]
+        result: Float32 = (rows.basis.T @ self._fan).reshape(-1, 3, self.size)
+        result *= (_slope(logs) * np.float32(scale)).T[..., None]
+        if greatest > 1.0:
+            tied = _tied(albedo)
+            weight = (tied / np.float32(tied.sum())) @ self._check.T
+            weight *= _slope(self._checked.logs(scores, offset))
+            rise = self._to_coordinates(self._checked.basis @ weight.T).astype(np.float32)
+            values = _reflectance(np, logs, out=logs) * np.float32(scale / greatest)
+            result -= values.T[..., None] * rise
+        result[..., point != clipped] = 0.0
+        return result
+
+    def decode_tensor(
+        self,
+        z: torch.Tensor,
+        offset: Float32 | torch.Tensor | None = None,
+        cells: ArrayLike | None = None,
+    ) -> torch.Tensor:
+        """`decode_values` in torch, on the device and in the precision of `z`; differentiable.
+
+        Its gradient by `z` is `jacobian`, with the same choices at the kinks, and it passes to
+        an `offset` that requires one.
+
+        Parameters
+        ----------
+        z : (k,) tensor, float32 or float64
+            Not checked for coordinates that are not finite (a device would have to be waited
+            for): they give NaN.
+        offset : (cells, 3) array or tensor, optional
+        cells : (n,) integers, optional
+            As for `decode_values`; on the host.
+
+        Returns
+        -------
+        (n, 3) tensor
+
+        Raises
+        ------
+        ValueError
+            On a wrong shape or precision, or an index outside the grid.
+        """
+        self._fitted()
+        if z.shape != (self.size,):
+            raise ValueError(f"z: expected shape ({self.size},), got {tuple(z.shape)}")
+        if z.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"z: expected float32 or float64, got {z.dtype}")
+        self._check_offset(offset)
         if offset is not None:
-            if offset.shape != logs.shape:
-                raise ValueError(f"offset: expected shape {logs.shape}, got {offset.shape}")
-            logs += offset
-        # no BRDF reaches 1e13: keep exp from overflowing for offsets from outside
-        np.exp(np.minimum(logs, 30.0, out=logs), out=logs)
-        logs -= np.float32(FLOOR)
-        np.maximum(logs, 0.0, out=logs)
-        return logs, float((self._albedo @ logs).max())
+            # arrays are copied here: torch warns of sharing one that is read-only
+            whole = offset if isinstance(offset, torch.Tensor) else torch.tensor(offset)
+            offset = whole.to(z)
+        on = self._on(z.device, z.dtype)
+        rows = on.every
+        if cells is not None:
+            index = torch.tensor(self._cell_indices(cells), device=z.device)
+            rows = _Rows(index, rows.basis[:, index], rows.mean[index])
+        scores = _channel_scores(on.opponent, torch.clamp(z, on.low, on.high))
+        values = _reflectance(torch, rows.logs(scores, offset)).T
+        albedo = _reflectance(torch, on.checked.logs(scores, offset)) @ on.check
+        tied = _tied(albedo)
+        greatest = torch.where(tied, albedo, 0.0).sum() / tied.sum()
+        scaled: torch.Tensor = values / torch.where(greatest > 1.0, greatest * _MARGIN, 1.0)
+        return scaled
+
+    def _on(self, device: torch.device, dtype: torch.dtype) -> _Tensors:
+        """The fitted state as tensors, kept: 2 MB in float32 for the default embedding."""
+        key = (device, dtype)
+        if key not in self._tensors:
+
+            def tensor(array: NDArray[Any], dtype: torch.dtype = dtype) -> torch.Tensor:
+                return torch.tensor(array, dtype=dtype, device=device)
+
+            # tensors made in inference mode could not be differentiated through later
+            with torch.inference_mode(False):
+                self._tensors[key] = _Tensors(
+                    _Rows(slice(None), tensor(self._every.basis), tensor(self._every.mean)),
+                    _Rows(
+                        tensor(self._checked.index, torch.int64),
+                        tensor(self._checked.basis),
+                        tensor(self._checked.mean),
+                    ),
+                    tensor(self._check),
+                    tensor(self.low_),
+                    tensor(self.high_),
+                    tensor(_OPPONENT),
+                )
+        return self._tensors[key]
+
+    def _rows(self, cells: ArrayLike | None) -> _Rows:
+        if cells is None:
+            return self._every
+        index = self._cell_indices(cells)
+        return _Rows(index, self.components_.take(index, axis=0).T, self.mean_[index])
+
+    def _cell_indices(self, cells: ArrayLike) -> NDArray[np.int64]:
+        index = np.asarray(cells)
+        if index.ndim != 1 or index.dtype.kind not in "iu":
+            raise ValueError(
+                f"cells: expected integers of shape (n,), got {index.dtype} of shape {index.shape}"
+            )
+        # a negative index would count from the end, and a large one is lost on a device
+        if index.size and (index.min() < 0 or index.max() >= self.grid_.size):
+            raise ValueError(
+                f"cells: expected indices in [0, {self.grid_.size}), "
+                f"got {index.min()} to {index.max()}"
+            )
+        return index.astype(np.int64, copy=False)
+
+    def _check_offset(self, offset: Float32 | torch.Tensor | None) -> None:
+        expected = (self.grid_.size, 3)
+        if offset is not None and offset.shape != expected:
+            raise ValueError(f"offset: expected shape {expected}, got {tuple(offset.shape)}")
+
+    def _decode(
+        self, z: ArrayLike, offset: Float32 | None, cells: ArrayLike | None = None
+    ) -> tuple[Float32, float]:
+        """f (n, 3) before its energy is checked, and its greatest directional albedo."""
+        scores = _channel_scores(_OPPONENT, self.clip(z)).astype(np.float32)
+        self._check_offset(offset)
+        logs = self._rows(cells).logs(scores, offset)
+        values: Float32 = np.ascontiguousarray(_reflectance(np, logs, out=logs).T)
+        if cells is None:
+            return values, float((self._albedo @ values).max())
+        return values, float(self._check_albedos(scores, offset).max())
+
+    def _check_albedos(self, scores: Float32, offset: Float32 | None) -> Float32:
+        """Directional albedos (3, 16) of channel scores (3, m), before the energy scaling."""
+        logs = self._checked.logs(scores, offset)
+        albedo: Float32 = _reflectance(np, logs, out=logs) @ self._check
+        return albedo
 
     def residual(self, brdf: TabulatedBRDF) -> Float32:
         """(cells, 3) difference of log(f + FLOOR) between a table and its encoding.
@@ -256,8 +482,8 @@ class BRDFEmbedding:
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        z = self.clip(self.encode(table)).reshape(3, -1)
-        decoded = self.mean_[:, None] + self.components_ @ (_OPPONENT.T @ z).T.astype(np.float32)
+        scores = _channel_scores(_OPPONENT, self.clip(self.encode(table))).astype(np.float32)
+        decoded = self._every.logs(scores, None).T
         return np.asarray(_log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
     def body_rows(self) -> Float64:
@@ -311,6 +537,28 @@ class BRDFEmbedding:
 def _log_map(values: NDArray[Any]) -> Float32:
     logs: Float32 = np.log(np.asarray(values, np.float32) + np.float32(FLOOR))
     return logs
+
+
+def _channel_scores(opponent: Any, z: Any) -> Any:
+    """(3 m,) coordinates to (3, m) channel scores; arrays or tensors."""
+    return opponent.T @ z.reshape(3, -1)
+
+
+def _reflectance(xp: Any, logs: Any, out: Any = None) -> Any:
+    """f from log(f + FLOOR); `xp` is numpy or torch. `out=logs` spares numpy the copies."""
+    raised = xp.exp(xp.clip(logs, None, _CAP, out=out), out=out)
+    return xp.clip(xp.subtract(raised, FLOOR, out=out), 0.0, None, out=out)
+
+
+def _slope(logs: Float32) -> Float32:
+    """d f / d log(f + FLOOR): f + FLOOR, or 0 beyond the kinks of `_reflectance`."""
+    raised = np.exp(np.minimum(logs, _CAP))
+    return np.where((raised >= FLOOR) & (logs <= _CAP), raised, np.float32(0.0))
+
+
+def _tied(albedo: Any) -> Any:
+    """Which albedos (3, 16) are the greatest; arrays or tensors."""
+    return albedo >= (1.0 - _TIE) * albedo.max()
 
 
 def _cell_weight(grid: HalfDiffGrid) -> Float32:

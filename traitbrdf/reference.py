@@ -1,16 +1,26 @@
 """The oracle: brute-force integration of the reflection equation in float64.
 
-I(x, wo) = integral of L(wi) rho(wi, wo) max(0, wi.n) d omega over the texels of the map (piecewise
-constant) plus the lights beside it. Slow and simple on purpose: every texel above the horizon is
-visited, texels are cut until they are small against their distance from the mirror peak and from
-the horizon, and the whole mesh is refined until two successive answers agree. It shares no
+I(x, wo) = integral of L(wi) V(x, wi) rho(wi, wo) max(0, wi.n) d omega over the texels of the map
+(piecewise constant) plus the lights beside it. Slow and simple on purpose: every texel above the
+horizon is visited, texels are cut until they are small against their distance from the mirror peak
+and from the horizon, and the whole mesh is refined until two successive answers agree. It shares no
 quadrature with `traitbrdf.transport`.
+
+Shadows are defined so that there is one truth to converge to. Each texel is divided into n x n
+pieces equal in both angles, with the least n for which none is taller than `SHADOW_CELL`; a piece
+is wholly visible or wholly hidden, as the one ray towards the centroid of its solid angle says. At
+one point the visible light is then again piecewise constant, and the stated errors concern its
+integral. What the pieces themselves are off by is not in them: the edge of a shadow passes through
+them, so the penumbra of a light k pieces wide has about k steps where that edge runs along their
+sides, and many more where it runs across. The mirror's delta term sends one ray in its own
+direction, a point or directional light one to the light.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,14 +28,23 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.directions import half_diff_angles, reflect, to_local
 from traitbrdf.formats import exposure_of, tone_map
-from traitbrdf.lights import EnvironmentMap, Light, PointLight
+from traitbrdf.lights import EnvironmentMap, Light, PointLight, texel_moments, turn_about_y
 from traitbrdf.scene import Scene
 
 Float64 = NDArray[np.float64]
+Index = NDArray[np.int64]
+Visible: TypeAlias = Callable[[Index, Float64], NDArray[np.bool_]]
+"""Whether light from infinity reaches points (m,) from world directions (m, 3): (m,) booleans."""
+Arriving: TypeAlias = tuple[Float64, Float64]
+"""World directions to a light and irradiance across them, (n, 3) each, as the n points get them."""
+
+SHADOW_CELL = 0.0125
+"""Greatest height in radians of a piece of the map that is visible or hidden as a whole."""
 
 _COARSEST = 0.2
 _MAX_CELLS = 1_000_000
 _CHUNK = 1 << 17
+_BLOCK = 256  # samples whose results are kept at a time
 _GAUSS = 0.5 / math.sqrt(3.0)  # the two Gauss-Legendre points, from the middle, in widths
 
 
@@ -38,19 +57,29 @@ def radiance(
     views: Float64,
     brdfs: Sequence[Reflectance],
     environment: EnvironmentMap | None = None,
-    lights: Sequence[Light] = (),
+    lights: Sequence[Light | Arriving] = (),
     positions: Float64 | None = None,
     tolerance: float = 1e-4,
+    visible: Visible | None = None,
+    shadow_cell: float = SHADOW_CELL,
 ) -> tuple[Float64, Float64]:
-    """Radiance that leaves surface points towards the viewer, unshadowed.
+    """Radiance that leaves surface points towards the viewer.
 
     Parameters
     ----------
     normals, views : (n, 3) world unit vectors, views towards the viewer and above the surface
     brdfs : B reflectances; each point is computed for all of them
-    environment, lights : what shines
+    environment : the map that shines
+    lights : what shines beside it
+        Lights, which meet no shadow, or pairs (directions, irradiance) of light as it arrives.
     positions : (n, 3) world positions, needed for point lights
     tolerance : relative to the pixel's largest channel
+    visible : callable or None
+        ``visible(point (m,), directions (m, 3)) -> (m,)`` tells what the map's light meets on its
+        way to points given by their index; None lets all of it pass.
+    shadow_cell : radians
+        Greatest height of the pieces of the map that are visible or hidden as a whole (see the
+        head of this module).
 
     Returns
     -------
@@ -63,8 +92,10 @@ def radiance(
     IntegrationError
         If the estimate stays above the tolerance.
     ValueError
-        If point lights come without positions.
+        If point lights come without positions, or `shadow_cell` is not above 0.
     """
+    if not shadow_cell > 0.0:
+        raise ValueError(f"shadow_cell: expected an angle above 0 radians, got {shadow_cell!r}")
     count = len(normals)
     if positions is None:
         if any(isinstance(light, PointLight) for light in lights):
@@ -73,18 +104,85 @@ def radiance(
     result = np.zeros((count, len(brdfs), 3))
     error = np.zeros_like(result)
     evaluate = _Evaluator(brdfs)
-    for p in range(count):
-        n, v = normals[p], views[p]
-        if environment is not None:
-            result[p], error[p] = _converge(environment, n, v, evaluate, tolerance, p)
-            mirror_light = environment.radiance(reflect(v, n)).astype(np.float64)
-            result[p] += np.stack([b.mirror for b in brdfs]) * mirror_light
-        wo = np.asarray(to_local(v, n), np.float64)
-        for light in lights:
-            toward, irradiance = light.arriving(positions[p : p + 1])
-            wi = np.asarray(to_local(toward, n[None]), np.float64)
-            cos = np.maximum(wi[:, 2], 0.0)
-            result[p] += evaluate(wi, wo, irradiance * cos[:, None])
+    if environment is not None:
+        result += _mirrored(normals, views, brdfs, environment, visible)
+        texels = _Cells.texels(environment.image)
+        pieces = None if visible is None else _Pieces(environment, shadow_cell)
+        for p in range(count):
+            cells = texels
+            if pieces is not None and visible is not None:
+                cells = pieces.seen(p, normals[p], visible)
+            n = np.asarray(environment.to_map(normals[p]), np.float64)
+            v = np.asarray(environment.to_map(views[p]), np.float64)
+            values, error[p] = _converge(cells, n, v, evaluate, tolerance, p)
+            result[p] += values
+    for light in lights:
+        toward, irradiance = light if isinstance(light, tuple) else light.arriving(positions)
+        for p in range(count):
+            wi, wo = np.asarray(to_local(np.stack([toward[p], views[p]]), normals[p]), np.float64)
+            result[p] += evaluate(wi[None], wo, irradiance[p : p + 1] * max(wi[2], 0.0))
+    return result, error
+
+
+def fragments(
+    scene: Scene,
+    index: ArrayLike,
+    brdfs: Sequence[Reflectance],
+    tolerance: float = 1e-4,
+    shadow_cell: float = SHADOW_CELL,
+) -> tuple[Float64, Float64]:
+    """What fragments of a scene add to their pixels, in all its light and shadows.
+
+    The sum over a fragment's samples of their share of the pixel times their radiance: a fragment
+    that covers a tenth of its pixel adds a tenth of its radiance.
+
+    Parameters
+    ----------
+    index : (m,) array_like of int
+        Which fragments of the scene.
+    brdfs : B reflectances; each fragment is computed for all of them
+    tolerance : of each sample, relative to its largest channel
+    shadow_cell : radians, as for `radiance`
+
+    Returns
+    -------
+    radiance, error : (m, B, 3)
+        As `radiance` gives them; the errors of a fragment's samples add up.
+
+    Raises
+    ------
+    IntegrationError
+        As `radiance` does; the points in its message are those of one block of samples.
+    IndexError
+        If there is no such fragment.
+    """
+    chosen = np.asarray(index, np.int64)
+    sample, owner, share = scene.samples(chosen)
+    result = np.zeros((len(chosen), len(brdfs), 3))
+    error = np.zeros_like(result)
+    casts = np.array(scene.casts, np.bool_)[scene.pixel_part[chosen]][owner]
+    for needs_rays in (False, True):
+        rows = np.flatnonzero(casts == needs_rays)
+        for start in range(0, len(rows), _BLOCK):
+            some = rows[start : start + _BLOCK]
+            here = sample[some]
+
+            def visible(point: Index, w: Float64, here: Index = here) -> NDArray[np.bool_]:
+                return scene.visible(here[point], w)
+
+            values, errors = radiance(
+                scene.normals[here],
+                scene.views[here],
+                brdfs,
+                scene.environment,
+                [scene.arriving(light, here) for light in scene.lights],
+                tolerance=tolerance,
+                visible=visible if needs_rays else None,
+                shadow_cell=shadow_cell,
+            )
+            weight = share[some, None, None]
+            np.add.at(result, owner[some], weight * values)
+            np.add.at(error, owner[some], weight * errors)
     return result, error
 
 
@@ -99,7 +197,7 @@ def render(
     Parameters
     ----------
     brdfs : one reflectance for all parts, or one for each part by name
-    tolerance : of each pixel, relative to its largest channel
+    tolerance : of each sample, relative to its largest channel
     progress : called with ("reference", fraction done); may raise to cancel
 
     Raises
@@ -116,20 +214,14 @@ def render(
             raise ValueError(f"brdfs: expected one for each part seen, got none for {missing}")
     image = scene.backdrop().astype(np.float64)
     flat = image.reshape(-1, 3)
+    flat *= scene.uncovered[:, None]
     done = 0
-    for index, name in enumerate(scene.parts):
-        pixels = np.flatnonzero(scene.pixel_part == index)
-        for some in np.array_split(pixels, math.ceil(len(pixels) / 64)) if len(pixels) else []:
-            values, _ = radiance(
-                scene.normals[some],
-                scene.views[some],
-                [brdfs[name] if isinstance(brdfs, Mapping) else brdfs],
-                scene.environment,
-                scene.lights,
-                scene.positions[some],
-                tolerance,
-            )
-            flat[scene.pixels[some]] = values[:, 0]
+    for part, name in enumerate(scene.parts):
+        index = np.flatnonzero(scene.pixel_part == part)
+        for some in np.array_split(index, math.ceil(len(index) / 64)) if len(index) else []:
+            brdf = brdfs[name] if isinstance(brdfs, Mapping) else brdfs
+            values, _ = fragments(scene, some, [brdf], tolerance)
+            np.add.at(flat, scene.pixels[some], values[:, 0])
             done += len(some)
             if progress is not None:
                 progress("reference", done / len(scene.pixels))
@@ -199,23 +291,109 @@ class _Evaluator:
         return result
 
 
-def _converge(
+class _Cells(NamedTuple):
+    """Lat-long rectangles of constant light: radiance (k, 3), and their edges (k,) in radians.
+
+    `top` and `bottom` are polar angles from +y, `left` and `right` azimuths 2 pi u of the map.
+    """
+
+    light: Float64
+    top: Float64
+    bottom: Float64
+    left: Float64
+    right: Float64
+
+    @classmethod
+    def texels(cls, image: NDArray[np.float32]) -> _Cells:
+        """The texels of a map (M, N, 3) that shine, in row-major order."""
+        rows, columns, _ = image.shape
+        row, column = np.nonzero(image.max(axis=-1) > 0.0)
+        down, across = math.pi / rows, 2.0 * math.pi / columns
+        return cls(
+            image[row, column].astype(np.float64),
+            row * down,
+            (row + 1) * down,
+            column * across,
+            (column + 1) * across,
+        )
+
+    def take(self, which: NDArray[np.generic]) -> _Cells:
+        """The rectangles of an index or a mask."""
+        return _Cells(*(array[which] for array in self))
+
+
+class _Pieces:
+    """The map cut into what is visible or hidden as a whole."""
+
+    def __init__(self, environment: EnvironmentMap, shadow_cell: float) -> None:
+        image = environment.image
+        rows, columns, _ = image.shape
+        n = math.ceil(math.pi / rows / shadow_cell)
+        fine = EnvironmentMap(image.repeat(n, axis=0).repeat(n, axis=1))
+        shining = fine.image.max(axis=-1) > 0.0
+        self.texels = _Cells.texels(image)
+        self.cells = _Cells.texels(fine.image)
+        # the texel that each piece is cut from, counted as in `texels`
+        number = np.cumsum(image.max(axis=-1) > 0.0).reshape(rows, columns) - 1
+        row, column = np.nonzero(shining)
+        self.texel = number[row // n, column // n]
+        moment = texel_moments(fine)[shining]
+        centroid = moment / np.linalg.norm(moment, axis=-1, keepdims=True)
+        self.toward = np.asarray(turn_about_y(centroid, environment.rotation), np.float64)
+        # no point of a piece is further from its centroid than this
+        self.reach = np.hypot(math.pi / (rows * n), 2.0 * math.pi / (columns * n))
+
+    def seen(self, point: int, normal: Float64, visible: Visible) -> _Cells:
+        """The light that reaches a point with a world normal (3,).
+
+        Texels that are not cut by a shadow stay whole: the integral is the same and sooner done.
+        """
+        above = np.flatnonzero(self.toward @ normal > -self.reach)
+        clear = np.zeros(len(above), bool)
+        for start in range(0, len(above), _CHUNK):
+            some = above[start : start + _CHUNK]
+            clear[start : start + _CHUNK] = visible(np.full(len(some), point), self.toward[some])
+        count = len(self.texels.top)
+        lit = np.bincount(self.texel[above[clear]], minlength=count) > 0
+        shaded = np.bincount(self.texel[above[~clear]], minlength=count) > 0
+        whole = self.texels.take(lit & ~shaded)
+        cut = self.cells.take(above[clear & (lit & shaded)[self.texel[above]]])
+        return _Cells(*(np.concatenate(pair) for pair in zip(whole, cut, strict=True)))
+
+
+def _mirrored(
+    normals: Float64,
+    views: Float64,
+    brdfs: Sequence[Reflectance],
     environment: EnvironmentMap,
-    normal: Float64,
-    view: Float64,
+    visible: Visible | None,
+) -> Float64:
+    """What the mirrors (delta terms) of B reflectances show of the map, (n, B, 3)."""
+    weight = np.stack([brdf.mirror for brdf in brdfs]) if brdfs else np.zeros((0, 3))
+    if not weight.any():
+        return np.zeros((len(normals), *weight.shape))
+    toward = np.asarray(reflect(views, normals), np.float64)
+    light = environment.radiance(toward).astype(np.float64)
+    if visible is not None:
+        light *= visible(np.arange(len(normals)), toward)[:, None]
+    return np.asarray(weight * light[:, None])
+
+
+def _converge(
+    cells: _Cells,
+    n: Float64,
+    v: Float64,
     evaluate: _Evaluator,
     tolerance: float,
-    pixel: int,
+    point: int,
 ) -> tuple[Float64, Float64]:
-    n = np.asarray(environment.to_map(normal), np.float64)
-    v = np.asarray(environment.to_map(view), np.float64)
     resolution = _COARSEST
-    previous = _integrate(environment, n, v, evaluate, resolution)
+    previous = _integrate(cells, n, v, evaluate, resolution)
     while True:
         resolution *= 0.5
-        current = _integrate(environment, n, v, evaluate, resolution)
+        current = _integrate(cells, n, v, evaluate, resolution)
         if current is None or previous is None:
-            raise IntegrationError(f"point {pixel}: more than {_MAX_CELLS} cells needed")
+            raise IntegrationError(f"point {point}: more than {_MAX_CELLS} cells needed")
         error = np.abs(current - previous).max(axis=-1, keepdims=True)
         scale = tolerance * current.max(axis=-1, keepdims=True)
         if np.all(error <= scale):
@@ -225,7 +403,7 @@ def _converge(
 
 
 def _integrate(
-    environment: EnvironmentMap,
+    cells: _Cells,
     n: Float64,
     v: Float64,
     evaluate: _Evaluator,
@@ -235,15 +413,10 @@ def _integrate(
 
     `n` and `v` are in the map's frame. None if it takes too many cells.
     """
-    columns = environment.image.shape[1]
     wo = np.asarray(to_local(v, n), np.float64)
-    row, column = np.nonzero(environment.image.max(axis=-1) > 0.0)
-    light = environment.image[row, column].astype(np.float64)
-    top, bottom = environment.row_edges[row], environment.row_edges[row + 1]
-    left = column * (2.0 * math.pi / columns)
-    right = (column + 1) * (2.0 * math.pi / columns)
+    light, top, bottom, left, right = cells
     samples: list[tuple[Float64, Float64]] = []
-    cells = 0
+    used = 0
     whole = -1.0  # the irradiance, texels at the horizon overrated: what cells are measured against
     while len(top):
         polar, azimuth = 0.5 * (top + bottom), 0.5 * (left + right)
@@ -286,8 +459,8 @@ def _integrate(
                 point = _direction(t[large], (azimuth + across * (right - left))[large])
                 weight = (0.5 * share * omega)[large] * np.maximum(point @ n, 0.0)
                 samples.append((point, light[large] * weight[:, None]))
-        cells += len(top)
-        if cells > _MAX_CELLS:
+        used += len(top)
+        if used > _MAX_CELLS:
             return None
         light = np.tile(light[cut], (4, 1))
         top, bottom, left, right = top[cut], bottom[cut], left[cut], right[cut]

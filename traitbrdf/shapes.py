@@ -4,9 +4,9 @@ Conventions: the world is y up, rays carry unit directions, lengths have the uni
 itself. `Hits` holds what a viewer sees: shading normals always face the viewer, whichever side
 of the surface is hit.
 
-A ray that starts *on* a mesh meets that mesh at once: before testing for shadow move the origin
-off along the normal, by some 1e-4 times `Shape.radius`. The sphere ignores hits nearer than
-1e-7 of its radius and needs no such offset.
+A ray that starts *on* a mesh meets that mesh at once: rays that test for shadow start at
+`Hits.start`, a little off it. The sphere ignores hits nearer than 1e-7 of its radius and needs no
+such offset.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import embreex.mesh_construction
 import embreex.rtcore_scene
@@ -39,6 +39,10 @@ Bool = NDArray[np.bool_]
 MIN_COSINE = 0.01
 """Least cosine between a mesh's shading normal and the direction to the viewer."""
 
+_MESH_OFFSET = 1e-4  # of the radius; shadow rays start so far off their triangle
+_CONVEX_FACES = 200_000  # more are not looked at: a hull of so many takes a second
+_CONVEX_HEIGHT = 1e-6  # of the radius; neighbours stand out less (files round to float32)
+_CONVEX_VOLUME = 1e-5  # of the volume; what the convex hull may have beyond the mesh
 _SPHERE_SELF_HIT = 1e-7  # of the radius; nearer hits are the surface point that the ray left
 
 
@@ -54,11 +58,15 @@ class Hits:
         World position; zero where the ray missed.
     normal : (n, 3) float64 array
         Unit shading normal in world space, facing the viewer; zero where the ray missed.
+    start : (n, 3) float64 array
+        Where rays that test for shadow start: off the surface, on the viewer's side; zero where
+        the ray missed.
     """
 
     part: Int
     position: Float
     normal: Float
+    start: Float
 
 
 class Shape(Protocol):
@@ -72,8 +80,10 @@ class Shape(Protocol):
         Centre of a bounding sphere.
     radius : float
         Radius of that bounding sphere.
+    lowest : float
+        World y of the lowest point.
     convex : bool
-        True where the shape is known to cast no shadow on itself.
+        True where the shape is known to cast no shadow on itself, seen from outside.
     """
 
     @property
@@ -84,6 +94,9 @@ class Shape(Protocol):
 
     @property
     def radius(self) -> float: ...
+
+    @property
+    def lowest(self) -> float: ...
 
     @property
     def convex(self) -> bool: ...
@@ -149,6 +162,11 @@ class Sphere:
     parts: tuple[str, ...] = ("sphere",)
     convex: bool = True
 
+    @property
+    def lowest(self) -> float:
+        """World y of the lowest point."""
+        return float(self.center[1]) - self.radius
+
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Nearest hits of rays from `origins` (n, 3) or (3,) along unit `directions` (n, 3).
 
@@ -170,7 +188,8 @@ class Sphere:
         position[hit] = self.center + self.radius * outward
         facing = _dot(outward, d[hit]) <= 0.0
         normal[hit] = np.where(facing[:, None], outward, -outward)
-        return Hits(np.where(hit, 0, -1).astype(np.int32), position, normal)
+        # shadow rays may start on the sphere itself: `_distance` overlooks where they start
+        return Hits(np.where(hit, 0, -1).astype(np.int32), position, normal, position)
 
     def occluded(
         self, origins: ArrayLike, directions: ArrayLike, max_distance: ArrayLike = math.inf
@@ -254,18 +273,20 @@ class Mesh:
     face_part : (F,) array_like of int
         Index into `parts` of each face.
     parts : sequence of str
-        Unique names.
+        Unique names; some may have no faces.
+    uvs : (V, 2) or (F, 3, 2) array_like or None
+        Texture coordinates of the vertices, or of each face's corners: u to the right, v up.
 
     Attributes
     ----------
-    vertices, faces, normals, face_part, parts
+    vertices, faces, normals, face_part, parts, uvs
         As given, less the dropped faces; read-only arrays. They build an equal mesh again.
     center : (3,) float64 array
         Centre of the bounding box, and of the bounding sphere.
     radius : float
         Radius of the bounding sphere.
-    convex : bool
-        Always False: convexity is not looked for.
+    lowest : float
+        World y of the lowest corner of a triangle.
 
     Raises
     ------
@@ -274,8 +295,6 @@ class Mesh:
         length, names repeat, or no triangle with an area is left.
     """
 
-    convex: bool = False
-
     def __init__(
         self,
         vertices: ArrayLike,
@@ -283,6 +302,7 @@ class Mesh:
         normals: ArrayLike,
         face_part: ArrayLike,
         parts: tuple[str, ...] | list[str],
+        uvs: ArrayLike | None = None,
     ) -> None:
         v = np.array(vertices, dtype=np.float64)
         f = np.array(faces)
@@ -290,7 +310,8 @@ class Mesh:
         p = np.array(face_part)
         self.parts = tuple(parts)
         _check_mesh(v, f, n, p, self.parts)
-        center, radius = _bounds(v[np.unique(f)])
+        uv = None if uvs is None else _checked_uvs(uvs, len(v), len(f))
+        center, radius = _bounds(_used(v, f)[0])
         corner = ((v - center) / radius)[f]
         across, up = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
         side = corner[:, 2] - corner[:, 1]
@@ -302,12 +323,15 @@ class Mesh:
         # stray vertices and triangles that were dropped must not blow up the bounding sphere
         self.center: Float
         self.radius: float
-        self.center, self.radius = _bounds(v[np.unique(f[keep])])
+        used, _ = _used(v, f[keep])
+        self.center, self.radius = _bounds(used)
+        self.lowest = float(used[:, 1].min())
         self._local = (v - self.center) / self.radius
         self.vertices: Float = v
         self.faces: Int = f[keep].astype(np.int32)
         self.normals: Float = _unit(n if n.ndim == 2 else n[keep])
         self.face_part: Int = p[keep].astype(np.int32)
+        self.uvs: Float | None = uv[keep] if uv is not None and uv.ndim == 3 else uv
         # a file's winding may disagree with its normals: where they clearly do (a coarse, strongly
         # curved triangle may seem to a little) the normals say which side is out
         facet = _unit(area[keep])
@@ -316,10 +340,13 @@ class Mesh:
         self._facet = np.where(against[:, None], -facet, facet)
         for array in (self.vertices, self.faces, self.normals, self.face_part, self.center):
             array.flags.writeable = False
+        if self.uvs is not None:
+            self.uvs.flags.writeable = False
 
     def __reduce__(self) -> tuple[type[Mesh], tuple[object, ...]]:
         # Embree's scene cannot be pickled or copied: build it again
-        return Mesh, (self.vertices, self.faces, self.normals, self.face_part, self.parts)
+        given = (self.vertices, self.faces, self.normals, self.face_part, self.parts, self.uvs)
+        return Mesh, given
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} triangles, parts={self.parts!r})"
@@ -337,8 +364,8 @@ class Mesh:
             If shapes do not fit, origins are not finite or directions are not of unit length.
         """
         o, d = _as_rays(origins, directions)
-        start, _ = self._approach(o, d)
-        found = self._embree.run(start, d.astype(np.float32), output=True)
+        origin, _ = self._approach(o, d)
+        found = self._embree.run(origin, d.astype(np.float32), output=True)
         face = np.asarray(found["primID"])
         hit = face >= 0
         face = face[hit]
@@ -347,19 +374,31 @@ class Mesh:
         weight = np.stack([1.0 - u - v, u, v], axis=-1)
         position = np.zeros(d.shape)
         normal = np.zeros(d.shape)
-        position[hit] = np.einsum("nc,nck->nk", weight, self.vertices[self.faces[face]])
-        smooth = np.einsum("nc,nck->nk", weight, self._corner_normals(face))
-        normal[hit] = _facing_normal(smooth, self._facet[face], -d[hit])
+        start = np.zeros(d.shape)
+        corners = self.vertices[self.faces[face]]
+        corner_normals = self._corner_normals(face)
+        point = np.einsum("nc,nck->nk", weight, corners)
+        smooth = np.einsum("nc,nck->nk", weight, corner_normals)
+        facet, wo = self._facet[face], -d[hit]
+        # the triangle tells which side is seen: at silhouettes the smooth normal alone does not
+        side = np.where(_dot(facet, wo) < 0.0, -1.0, 1.0)
+        position[hit] = point
+        normal[hit] = _facing_normal(smooth, facet, side, wo)
+        start[hit] = (
+            point
+            + _smooth_lift(point, weight, corners, corner_normals, facet, side)
+            + (_MESH_OFFSET * self.radius * side)[:, None] * facet
+        )
         part = np.full(len(d), -1, dtype=np.int32)
         part[hit] = self.face_part[face]
-        return Hits(part, position, normal)
+        return Hits(part, position, normal, start)
 
     def occluded(
         self, origins: ArrayLike, directions: ArrayLike, max_distance: ArrayLike = math.inf
     ) -> Bool:
         """Whether rays (n, 3) meet the mesh before `max_distance`, a number or (n,).
 
-        An origin on the surface meets the surface: see the head of this module.
+        An origin on the surface meets the surface: start at `Hits.start`.
 
         Raises
         ------
@@ -404,11 +443,23 @@ class Mesh:
         return corner
 
     @functools.cached_property
+    def convex(self) -> bool:
+        """True where the mesh is closed and convex for certain, and not too large to tell."""
+        return len(self.faces) <= _CONVEX_FACES and _is_convex(self._local, self.faces)
+
+    @functools.cached_property
     def _embree(self) -> embreex.rtcore_scene.EmbreeScene:
         # robust: rays through a shared edge hit one of its two triangles and never slip between
         scene = embreex.rtcore_scene.EmbreeScene(robust=True)
         embreex.mesh_construction.TriangleMesh(scene, self._local.astype(np.float32), self.faces)
         return scene
+
+
+def _used(points: Float, faces: NDArray[np.integer]) -> tuple[Float, NDArray[np.integer]]:
+    """Those of points (V, 3) that faces (F, 3) use, in order, and the faces' indices among them."""
+    mask = np.zeros(len(points), dtype=bool)
+    mask[faces] = True
+    return points[mask], (np.cumsum(mask) - 1)[faces]
 
 
 def _bounds(points: Float) -> tuple[Float, float]:
@@ -452,7 +503,62 @@ def _check_mesh(
         raise ValueError(f"parts: expected unique names, got {parts}")
 
 
-def _facing_normal(smooth: Float, facet: Float, wo: Float) -> Float:
+def _checked_uvs(uvs: ArrayLike, vertices: int, faces: int) -> Float:
+    """Texture coordinates as float64, (V, 2) or (F, 3, 2); ValueError where they do not fit."""
+    uv = np.array(uvs, dtype=np.float64)
+    if uv.shape not in ((vertices, 2), (faces, 3, 2)):
+        raise ValueError(f"uvs: expected shape {(vertices, 2)} or {(faces, 3, 2)}, got {uv.shape}")
+    if not np.isfinite(uv).all():
+        raise ValueError("uvs: expected finite numbers, got NaN or infinity")
+    return uv
+
+
+def _is_convex(points: Float, faces: NDArray[np.integer]) -> bool:
+    """Whether triangles (F, 3) of points (V, 3), at most 1 from their centre, bound a convex body.
+
+    Closed: each edge has two triangles. No edge bends inwards. And the body is all of its convex
+    hull: a surface that bends outwards everywhere may still wind round twice or be in two pieces,
+    and bends too small to count may add up. Neither winding nor normals matter.
+    """
+    points, faces = _used(points, faces)
+    # most shapes have points on both sides of one of a few planes: so much for them
+    few = points[faces[:: len(faces) // 16 + 1]]
+    planes = _unit(np.cross(few[:, 1] - few[:, 0], few[:, 2] - few[:, 0]))
+    height = points @ planes.T - _dot(planes, few[:, 0])
+    if np.minimum(height.max(axis=0), -height.min(axis=0)).max() > 1e-3:
+        return False
+    corners = points[faces]
+    double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.sqrt(_dot(double, double))
+    # the surface's centroid is well inside; that of its corners may crowd at one side
+    inner = np.average(corners.mean(axis=1), axis=0, weights=area)
+    normal = _unit(double)
+    offset = _dot(normal, corners[:, 0] - inner)
+    normal = np.where(offset[:, None] < 0.0, -normal, normal)
+    offset = np.abs(offset)
+    welded, weld = np.unique(points + 0.0, axis=0, return_inverse=True)  # -0.0 becomes 0.0
+    corner = weld.reshape(-1)[faces]
+    a, b = corner, np.roll(corner, -1, axis=1)
+    edge = (np.minimum(a, b) * len(welded) + np.maximum(a, b)).ravel()
+    order = np.argsort(edge, kind="stable")
+    one, other = order[0::2], order[1::2]
+    if len(edge) % 2 or (edge[one] != edge[other]).any():
+        return False
+    facing = welded[np.roll(corner, 1, axis=1).ravel()] - inner  # the corner across from each edge
+    height = _dot(facing[other], normal[one // 3]) - offset[one // 3]
+    if height.max() > _CONVEX_HEIGHT:
+        return False
+    volume = float(np.sum(area * offset)) / 3.0
+    import scipy.spatial  # slow to import, and few shapes come so far
+
+    try:
+        hull = float(scipy.spatial.ConvexHull(welded).volume)
+    except scipy.spatial.QhullError:  # flat
+        return False
+    return abs(hull - volume) <= _CONVEX_VOLUME * hull
+
+
+def _facing_normal(smooth: Float, facet: Float, side: Float, wo: Float) -> Float:
     """Shading normals (n, 3) that face the viewer, by a cosine of at least `MIN_COSINE`.
 
     Parameters
@@ -461,14 +567,13 @@ def _facing_normal(smooth: Float, facet: Float, wo: Float) -> Float:
         Interpolated outward normals, of any length.
     facet : (n, 3) array
         Unit outward normals of the triangles.
+    side : (n,) array
+        1 where the triangle's outer side is seen, -1 where its inner.
     wo : (n, 3) array
         Unit directions to the viewer.
     """
     vanished = _dot(smooth, smooth) < 1e-24  # the corners' normals cancel
-    normal = _unit(np.where(vanished[:, None], facet, smooth))
-    # the triangle tells which side is seen: at silhouettes the smooth normal alone does not
-    behind = _dot(facet, wo) < 0.0
-    normal = np.where(behind[:, None], -normal, normal)
+    normal = side[:, None] * _unit(np.where(vanished[:, None], facet, smooth))
     low = np.flatnonzero(_dot(normal, wo) < MIN_COSINE)
     if len(low):
         w = wo[low]
@@ -478,6 +583,36 @@ def _facing_normal(smooth: Float, facet: Float, wo: Float) -> Float:
         cosine = MIN_COSINE * (1.0 + 1e-9)  # a hair above, so that rounding stays above too
         normal[low] = cosine * w + math.sqrt(1.0 - cosine**2) * tangent
     return normal
+
+
+def _smooth_lift(
+    point: Float, weight: Float, corners: Float, normals: Float, facet: Float, side: Float
+) -> Float:
+    """Offsets (n, 3) from points on triangles to the smooth surface that their normals tell of.
+
+    Without them a surface lit at a grazing angle would lie in the shadow of its own coarse
+    triangles: Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II (2021). A point goes to
+    the mean, by its barycentric weights, of its projections on the corners' tangent planes. Flat
+    and hollow triangles are left alone.
+
+    Parameters
+    ----------
+    point, facet : (n, 3) arrays
+        The points, and the unit outward normals of their triangles.
+    weight : (n, 3) array
+        Barycentric weights of the corners.
+    corners, normals : (n, 3, 3) arrays
+        Positions and unit outward normals of the corners.
+    side : (n,) array
+        1 where the triangle's outer side is seen, -1 where its inner.
+    """
+    height = np.einsum("nck,nck->nc", point[:, None, :] - corners, normals)
+    # seen from inside, what bulges is hollow
+    depth = np.minimum(side[:, None] * height, 0.0)
+    lift = -np.einsum("nc,nck->nk", side[:, None] * weight * depth, normals)
+    # normals that contradict their triangle must not sink the point
+    outwards = side * _dot(lift, facet) > 0.0
+    return np.where(outwards[:, None], lift, 0.0)
 
 
 # ---------------------------------------------------------------------------------------- teapot
@@ -574,12 +709,16 @@ _PLACEHOLDER = re.compile(r"(geometry|GLTF|mesh|default)?([ _.]?\d+)?", re.IGNOR
 
 @dataclass(frozen=True)
 class _Piece:
-    """Triangles of one part of a file; `normals` (F, 3, 3) is NaN where the file has none."""
+    """Triangles of one part of a file.
+
+    `normals` (F, 3, 3) and `uvs` (F, 3, 2) of the corners are NaN where the file has none.
+    """
 
     name: str
     vertices: Float
     faces: NDArray[np.int64]
     normals: Float
+    uvs: Float
 
 
 def load_mesh(path: str | PathLike[str]) -> Mesh:
@@ -591,6 +730,8 @@ def load_mesh(path: str | PathLike[str]) -> Mesh:
     Normals are the file's own; where it has none they are averaged over the triangles about a
     vertex, weighted by their angles, across the borders of parts too. Polygons are split into
     fans. Nodes of a glTF scene are placed by their transforms; units and axes stay as they are.
+    Texture coordinates are kept, with v upwards; where only some corners have any, the others lie
+    at 0, 0. glTF: those of primitives with a material.
 
     Parameters
     ----------
@@ -631,6 +772,8 @@ def load_mesh(path: str | PathLike[str]) -> Mesh:
     missing = ~(np.isfinite(length) & (length > 0.0))
     if missing.any():
         normals[missing] = _smooth_corner_normals(vertices, faces)[missing]
+    uvs = np.concatenate([piece.uvs for piece in pieces])
+    textured = np.isfinite(uvs).all(axis=-1, keepdims=True)
     names = [piece.name for piece in pieces]
     if len(set(names)) == 1 and _PLACEHOLDER.fullmatch(names[0]):
         names = [file.stem] * len(names)
@@ -639,7 +782,14 @@ def load_mesh(path: str | PathLike[str]) -> Mesh:
         [np.full(len(p.faces), parts.index(n)) for p, n in zip(pieces, names, strict=True)]
     )
     try:
-        return Mesh(vertices, faces, normals, face_part, parts)
+        return Mesh(
+            vertices,
+            faces,
+            normals,
+            face_part,
+            parts,
+            np.where(textured, uvs, 0.0) if textured.any() else None,
+        )
     except ValueError as error:
         raise FormatError(file, "triangles with an area", str(error)) from error
 
@@ -673,35 +823,37 @@ def _smooth_corner_normals(vertices: Float, faces: NDArray[np.int64]) -> Float:
 def _read_obj(file: Path) -> list[_Piece]:
     """Parts of a Wavefront OBJ file in order of appearance.
 
-    Read here and not by trimesh, which drops group names and the order of parts.
+    Read here and not by trimesh, which can split a file at its groups but counts relative indices
+    from the file's end, forgets the names of materials without their library, and drops all
+    normals and texture coordinates where one corner has none.
     """
     text = file.read_text("utf-8", errors="replace").replace("\\\n", " ")
-    positions: list[list[float]] = []
-    normals: list[list[float]] = []
-    corners: list[tuple[int, int]] = []  # (position, normal or -1), three a triangle
+    # one flat list each: lists of rows would keep the garbage collector busy
+    tables: dict[str, list[float]] = {"v": [], "vt": [], "vn": []}
+    corners: list[tuple[int, int, int]] = []  # rows of v, vt, vn, or -1; three a triangle
     labels: list[tuple[str, str, str]] = []  # group, object, material of each triangle
     current = {"g": "", "o": "", "usemtl": ""}
+    label = ("", "", "")
+    known: dict[str, tuple[int, int, int]] = {}  # corners seen before: most are, some six times
     for number, line in enumerate(text.splitlines(), start=1):
         key, *words = line.split("#")[0].split() or [""]
         try:
-            if key == "v":
-                positions.append([float(x) for x in words[:3]])
-                if len(positions[-1]) != 3:
-                    raise ValueError("fewer than three coordinates")
-            elif key == "vn":
-                normals.append([float(x) for x in words[:3]])
-                if len(normals[-1]) != 3:
-                    raise ValueError("fewer than three coordinates")
+            if key in tables:
+                row = [float(x) for x in words[:3]]
+                least = 1 if key == "vt" else 3
+                if len(row) < least:
+                    raise ValueError(f"fewer than {least} coordinates")
+                tables[key] += [*row, 0.0][:2] if key == "vt" else row
             elif key == "f":
-                polygon = [_obj_corner(w, len(positions), len(normals)) for w in words]
+                polygon = [known.get(w) or _obj_corner(w, tables, known) for w in words]
                 if len(polygon) < 3:
                     raise ValueError("fewer than three corners")
-                label = (current["g"], current["o"], current["usemtl"])
                 for i in range(1, len(polygon) - 1):
                     corners += [polygon[0], polygon[i], polygon[i + 1]]
                     labels.append(label)
             elif key in current:
                 current[key] = " ".join(words)
+                label = (current["g"], current["o"], current["usemtl"])
         except ValueError as error:
             raise FormatError(
                 file,
@@ -715,10 +867,11 @@ def _read_obj(file: Path) -> list[_Piece]:
     divides = [c for c in columns if len(set(c)) > 1]
     named = [c for c in columns[:2] if c[0]]
     names = [*divides, *named, columns[0]][0]
-    vertex = np.array(positions)
-    # a last row of NaN answers index -1, a corner without a normal
-    normal = np.array([*normals, [math.nan] * 3])
-    face, face_normal = np.moveaxis(np.array(corners).reshape(-1, 3, 2), -1, 0)
+    vertex = np.array(tables["v"]).reshape(-1, 3)
+    # a last row of NaN answers index -1
+    texture = np.array(tables["vt"] + [math.nan] * 2).reshape(-1, 2)
+    normal = np.array(tables["vn"] + [math.nan] * 3).reshape(-1, 3)
+    face, face_uv, face_normal = np.moveaxis(np.array(corners).reshape(-1, 3, 3), -1, 0)
     order = {name: i for i, name in enumerate(dict.fromkeys(names))}
     index = np.array([order[name] for name in names])
     pieces = []
@@ -730,45 +883,51 @@ def _read_obj(file: Path) -> list[_Piece]:
                 vertex[used],
                 local.reshape(-1, 3),
                 normal[face_normal[index == i]],
+                texture[face_uv[index == i]],
             )
         )
     return pieces
 
 
-def _obj_corner(word: str, positions: int, normals: int) -> tuple[int, int]:
-    """Indices from 0 of an OBJ corner ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``; -1: no normal."""
-    fields = word.split("/")
+def _obj_corner(
+    word: str, tables: dict[str, list[float]], known: dict[str, tuple[int, int, int]]
+) -> tuple[int, int, int]:
+    """Rows of an OBJ corner ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``; -1 where there is none."""
+    fields = [*word.split("/"), "", ""]
 
-    def index(field: str, count: int) -> int:
+    def row(field: str, count: int) -> int:
         value = int(field)
         found = value - 1 if value > 0 else count + value
         if value == 0 or not 0 <= found < count:
             raise ValueError(f"index {value} of {count}")
         return found
 
-    normal = index(fields[2], normals) if len(fields) > 2 and fields[2] else -1
-    return index(fields[0], positions), normal
+    vertex = row(fields[0], len(tables["v"]) // 3)
+    normal = row(fields[2], len(tables["vn"]) // 3) if fields[2] else -1
+    try:
+        texture = row(fields[1], len(tables["vt"]) // 2) if fields[1] else -1
+    except ValueError:
+        texture = -1  # some writers leave the numbers and not the coordinates: no loss to a shape
+    if "-" not in word:  # a relative index depends on where it stands
+        known[word] = vertex, texture, normal
+    return vertex, texture, normal
 
 
 def _read_trimesh(file: Path) -> list[_Piece]:
     """Parts of a PLY, glTF or glb file, in the order of the file's geometries."""
-    import trimesh  # half a second of imports that most sessions never need
-
     try:
-        # unprocessed: trimesh would merge vertices and with them the file's own normals
-        scene = trimesh.load(str(file), force="scene", process=False)
-        if not isinstance(scene, trimesh.Scene):
-            raise TypeError(f"trimesh made a {type(scene).__name__} of it")
-        geometries = {
-            name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh)
-        }
+        graph, geometries = _load_scene(file)
+        uvs = {name: _corner_uvs(g) for name, g in geometries.items()}
+        if file.suffix.lower() == ".ply" and not all(np.isnan(uv).all() for uv in uvs.values()):
+            # where trimesh cuts a PLY file's vertices at a texture's seams, it loses their normals
+            _, geometries = _load_scene(file, fix_texture=False)
         names = _geometry_names(geometries, file)
         pieces = []
-        for node in scene.graph.nodes_geometry:
-            matrix, geometry_key = scene.graph[node]
+        for node in graph.nodes_geometry:
+            matrix, geometry_key = graph[node]
             key = str(geometry_key)
             if key in geometries:
-                pieces.append(_placed(geometries[key], np.asarray(matrix), names[key]))
+                pieces.append(_placed(geometries[key], np.asarray(matrix), names[key], uvs[key]))
     # whatever trips a reader over a broken file, the caller needs one kind of error
     except Exception as error:
         raise FormatError(
@@ -776,6 +935,18 @@ def _read_trimesh(file: Path) -> list[_Piece]:
         ) from error
     order = list(names.values())
     return sorted(pieces, key=lambda piece: order.index(piece.name))
+
+
+def _load_scene(file: Path, **options: Any) -> tuple[Any, dict[str, trimesh.Trimesh]]:
+    """The scene graph of a file and its geometries that are made of triangles."""
+    import trimesh  # half a second of imports that most sessions never need
+
+    # unprocessed: trimesh would merge vertices and with them the file's own normals
+    scene = trimesh.load(str(file), force="scene", process=False, **options)
+    if not isinstance(scene, trimesh.Scene):
+        raise TypeError(f"trimesh made a {type(scene).__name__} of it")
+    found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh)}
+    return scene.graph, found
 
 
 def _geometry_names(geometries: dict[str, trimesh.Trimesh], file: Path) -> dict[str, str]:
@@ -793,8 +964,17 @@ def _geometry_names(geometries: dict[str, trimesh.Trimesh], file: Path) -> dict[
     return names
 
 
-def _placed(geometry: trimesh.Trimesh, matrix: Float, name: str) -> _Piece:
-    """A geometry under a node's 4 x 4 transform."""
+def _corner_uvs(geometry: trimesh.Trimesh) -> Float:
+    """Texture coordinates (F, 3, 2) of a geometry's corners; NaN where it has none."""
+    uv = getattr(geometry.visual, "uv", None)
+    if uv is None or np.shape(uv)[:1] != (len(geometry.vertices),):
+        uv = np.full((len(geometry.vertices), 2), np.nan)
+    corners: Float = np.asarray(uv, dtype=np.float64)[:, :2][geometry.faces]
+    return corners
+
+
+def _placed(geometry: trimesh.Trimesh, matrix: Float, name: str, uvs: Float) -> _Piece:
+    """A geometry under a node's 4 x 4 transform, with texture coordinates (F, 3, 2)."""
     linear = matrix[:3, :3]
     with np.errstate(invalid="ignore", over="ignore"):  # `load_mesh` looks for such vertices
         vertices = np.asarray(geometry.vertices, dtype=np.float64) @ linear.T + matrix[:3, 3]
@@ -813,4 +993,5 @@ def _placed(geometry: trimesh.Trimesh, matrix: Float, name: str) -> _Piece:
         vertices,
         faces[:, ::-1] if mirrored else faces,
         normals[:, ::-1] if mirrored else normals,
+        uvs[:, ::-1] if mirrored else uvs,
     )

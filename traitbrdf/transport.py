@@ -1,45 +1,40 @@
 """Real-time frames: light transport as a linear operator from table cells to pixels, compressed.
 
-For one scene the radiance of a pixel is linear in the BRDF table, I = W rho. A row of W collects,
-for every piece of light, the eight cells that `TabulatedBRDF.eval` would interpolate between.
+For one scene the radiance of a fragment (what one part shows in one pixel) is linear in the BRDF
+table, I = W rho; `quadrature.Operator` knows the rows of W, shadows included.
 
-*Rows* (`Operator`). The map is walked as a tree (`lights.LightTree`): a node of light stands for
-its texels where it looks small from the mirror peak, measured in half-vector space; a texel that
-looks large is cut further. A node's irradiance is exact (vector moments), and its own extent is
-carried into theta_h to second order (two samples one standard deviation apart), so the error
-falls with the fourth power of the node size while the number of nodes grows with its inverse
-square.
+*Basis.* Seen through one part of one scene, the BRDFs of interest span few dimensions. From the
+rows W_S of a subset S of fragments and training tables X, the SVD of the column-normalised
+W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables whose images W M span
+the frames; Q = orth(W M), sorted by what the training set needs. Frame = Q (C rho). The orthogonal
+choice C = Q^T W needs every row; weighted least squares on some five times more rows than Q has
+columns comes within a tenth of its error, if the fragments with the greatest leverage in Q are
+among them and the rest is drawn at random (a uniform draw errs up to ten times as much on tables
+outside the training set). (Projecting rho on an orthonormal basis of cell space instead errs by
+tens of percent.)
 
-*Basis* (`Transport`). Seen through one part of one scene, the BRDFs of interest span few
-dimensions. From the rows W_S of a subset S of pixels and training tables X, the SVD of the
-column-normalised W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables
-whose images W M span the frames; Q = orth(W M) is computed over all pixels, chunk by chunk.
-Frame = Q (C rho). The orthogonal choice C = Q^T W needs every row a second time; weighted least
-squares on some six times more rows than Q has columns comes within a tenth of its error, if the
-pixels with the greatest leverage in Q are among them and the rest is drawn at random (a uniform
-draw errs up to ten times as much on tables outside the training set). (Projecting rho on an
-orthonormal basis of cell space instead errs by tens of percent.)
+*Error.* Some fragments, drawn evenly from all that are shown, keep their exact rows, built at twice
+the resolution, shadows too: comparing them gives every frame its measured error. (Drawing them from
+outside the fit alone would overstate the error of small parts, of which the fit holds most.)
 
-*Error*. Some pixels, drawn evenly from all that are shown, keep their exact rows, built at twice
-the resolution: comparing them gives every frame its measured error. (Drawing them from outside the
-fit alone would overstate the error of small parts, of which the fit holds most pixels.)
+*Drafts.* Before a view or a light is prepared, `Draft` renders its tables at a small size.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from traitbrdf.brdf import HalfDiffGrid
-from traitbrdf.directions import half_diff_angles, reflect, to_local
-from traitbrdf.lights import LightTree
+from traitbrdf.lights import Light, LightTree, PointLight
 from traitbrdf.models import (
     GGX,
     AshikhminShirley,
@@ -52,103 +47,33 @@ from traitbrdf.models import (
     Sheen,
     TorranceSparrowSimplified,
 )
+from traitbrdf.quadrature import Operator as Operator
+from traitbrdf.quadrature import Progress as Progress
 from traitbrdf.scene import Scene
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Progress = Callable[[str, float], None]
-"""Called with what is being done and the fraction done; may raise to cancel."""
-
-_ROWS_AT_ONCE = 512
-
-
-class Operator:
-    """Rows of W: what every cell of a table contributes to a pixel.
-
-    Parameters
-    ----------
-    scene : Scene
-    grid : HalfDiffGrid of the "folded" layout
-    resolution : float
-        1 is the default; 2 halves the size of the light nodes (four times as many).
-    """
-
-    def __init__(self, scene: Scene, grid: HalfDiffGrid, resolution: float = 1.0) -> None:
-        if grid.layout != "folded":
-            raise ValueError(f"grid: expected the 'folded' layout, got {grid.layout!r}")
-        if not (math.isfinite(resolution) and resolution > 0.0):
-            raise ValueError(f"resolution: expected a positive number, got {resolution!r}")
-        self.scene = scene
-        self.grid = grid
-        self.resolution = resolution
-        self._tree = LightTree.build(scene.environment)
-        self._nodes = _pack(self._tree)
-        to_map = scene.environment.to_map
-        self._normals = np.ascontiguousarray(to_map(scene.normals))
-        self._views = np.ascontiguousarray(to_map(scene.views))
-
-    def rows(self, index: NDArray[np.int64], resolution: float | None = None) -> Float32:
-        """(m, 3, grid.size) rows of the covered pixels `index` (m,), one for each colour."""
-        out = np.empty((len(index), 3, self.grid.size), np.float32)
-        scale = 1.0 / (self.resolution if resolution is None else resolution)
-        tree = self._tree
-        _fill_rows(
-            out, self._normals[index], self._views[index],
-            self._nodes, tree.child, tree.rectangle,
-            self.scene.environment.image, *self.grid.shape,
-            0.4 * scale, scale**2 / 500.0, 0.02 * scale, 0.08 * scale,
-        )  # fmt: skip
-        self._add_lights(out, index)
-        return out
-
-    def images(self, index: NDArray[np.int64], tables: torch.Tensor) -> torch.Tensor:
-        """(3, m, T) radiance of the pixels `index` under tables (3, grid.size, T), in chunks."""
-        parts = [
-            torch.bmm(torch.from_numpy(self.rows(chunk)).permute(1, 0, 2), tables)
-            for chunk in _chunks(index)
-        ]
-        return torch.cat([tables.new_zeros((3, 0, tables.shape[-1])), *parts], dim=1)
-
-    def _add_lights(self, out: Float32, index: NDArray[np.int64]) -> None:
-        scene = self.scene
-        normals = scene.normals[index]
-        wo = to_local(scene.views[index], normals)
-        for light in scene.lights:
-            toward, irradiance = light.arriving(scene.positions[index])
-            wi = to_local(toward, normals)
-            cos = np.maximum(wi[:, 2], 0.0)
-            cells, corner = self.grid.stencil(*half_diff_angles(wi, wo))
-            weight = irradiance * cos[:, None]
-            at = np.arange(len(index))
-            for k in range(8):
-                for c in range(3):
-                    out[at, c, cells[:, k]] += (corner[:, k] * weight[:, c]).astype(np.float32)
-
-
-@dataclass
-class _Draft:
-    """A part while its basis is being made."""
-
-    pixels: NDArray[np.int64]
-    basis: torch.Tensor  # (3, P, r), orthonormal where pixels are damped
-    damping: torch.Tensor  # (3, P, 1)
-    fit: NDArray[np.int64]
-    weight: Float64
-    rows: Float32
-    probes: NDArray[np.int64]
-    exact: Float32
+Int64 = NDArray[np.int64]
 
 
 @dataclass
 class _PartBasis:
-    """One part's compressed operator."""
+    """One part's compressed operator; C is 3, or 1 where all light is grey."""
 
-    pixels: torch.Tensor  # (P,) flat pixel indices
-    basis: torch.Tensor  # Q^T (3, r, P): this way round a product with a vector is fastest
-    projection: torch.Tensor  # C (3, r, cells)
-    probe_rows: torch.Tensor  # (3, m, cells)
-    probe_basis: torch.Tensor  # (3, m, r)
+    pixels: torch.Tensor  # (P,) flat pixel index of each fragment, each at most once
+    basis: torch.Tensor  # Q^T (C, r, P): this way round a product with a vector is fastest
+    cells: torch.Tensor  # (n,) the cells of the grid that the part sees
+    place: torch.Tensor  # (n,) where they are among `Transport.cells`
+    projection: torch.Tensor  # C (C, r, n)
+    probe_rows: torch.Tensor  # (C, m, n)
+    probe_basis: torch.Tensor  # (C, m, r)
+    probes: torch.Tensor  # (m,) which fragments of the part they are
     mirror: torch.Tensor  # (P, 3) what a perfect mirror shows
+
+
+_STORED = (
+    "pixels", "basis", "cells", "projection", "probe_rows", "probe_basis", "probes", "mirror"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -227,7 +152,7 @@ def _smooth_fields(grid: HalfDiffGrid, count: int, rng: np.random.Generator) -> 
 
 
 class Transport:
-    """The compressed operator of a scene: `shade` turns a table into a part's pixels.
+    """The compressed operator of a scene: `shade` turns a table into a part's fragments.
 
     Parameters
     ----------
@@ -237,21 +162,23 @@ class Transport:
     training : Training
         What the basis is fitted to: see `training_tables`.
     rank : int
-        Basis images for each part and colour.
+        At most so many basis images for each part and colour.
     resolution : float
         As for `Operator`.
     seed : int
-        Chooses the subset and the probe pixels.
+        Chooses the subset and the probes.
     device : torch device of the frames
-    progress : called with (stage, fraction)
+    progress : called with (stage, fraction); may raise to cancel
     """
 
-    TRAINING_ROWS = 320
-    """Pixels of a part (S) on which the training tables are compared."""
-    FIT_FACTOR = 6
+    TRAINING_ROWS = 128
+    """Fragments of a part (S) on which the training tables are compared."""
+    FIT_FACTOR = 5
     """Rows of the least-squares fit for each basis image."""
     PROBES = 48
-    """Pixels of a part that are kept exact, to measure errors."""
+    """Fragments of a part that are kept exact, to measure errors."""
+    ENOUGH = 1e-4
+    """Basis images that carry less of the training images than this are left out."""
 
     def __init__(
         self,
@@ -272,122 +199,306 @@ class Transport:
             )
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
+        self._begin(scene, grid, rank, resolution, device)
+        report = progress or (lambda stage, fraction: None)
+        rng = np.random.default_rng(seed)
+        tables = torch.from_numpy(np.ascontiguousarray(training.tables))
+        importance = torch.from_numpy(training.weight)
+        total = max(len(scene.pixels), 1)
+        sizes = [len(range(*scene.part_slice(p).indices(total))) for p in range(len(scene.parts))]
+        shown = [part for part, size in enumerate(sizes) if size]
+        self.parts = [None] * len(sizes)
+        # the next part's rays are cast while this one is shaded
+        cancelled = threading.Event()
+
+        def cast(part: int) -> None:
+            def check(stage: str, fraction: float) -> None:
+                if cancelled.is_set():
+                    raise concurrent.futures.CancelledError
+
+            self.operator.prepare(part, check)
+
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:
+            try:
+                waiting = [pool.submit(cast, part) for part in shown[:1]]
+                done = 0
+                for k, part in enumerate(shown):
+                    waiting[k].result()
+                    waiting += [pool.submit(cast, other) for other in shown[k + 1 : k + 2]]
+
+                    def told(
+                        stage: str, fraction: float, part: int = part, done: int = done
+                    ) -> None:
+                        report(stage, (done + fraction * sizes[part]) / total)
+
+                    self.parts[part] = self._compress(part, tables, importance, rng, told)
+                    done += sizes[part]
+            finally:
+                cancelled.set()
+        self._join_cells()
+
+    def _begin(
+        self,
+        scene: Scene,
+        grid: HalfDiffGrid,
+        rank: int,
+        resolution: float,
+        device: str | torch.device,
+    ) -> None:
         self.scene = scene
         self.grid = grid
         self.rank = rank
+        self.resolution = resolution
         self.device = torch.device(device)
-        self.operator = Operator(scene, grid, resolution)
-        report = progress or (lambda stage, fraction: None)
-        rng = np.random.default_rng(seed)
-        self._backdrop = torch.from_numpy(scene.backdrop()).reshape(-1, 3).to(self.device)
-        tables = torch.from_numpy(np.ascontiguousarray(training.tables))
-        importance = torch.from_numpy(training.weight)
-        drafts: list[_Draft | None] = []
-        done, total = 0, max(len(scene.pixels), 1)
-        for part in range(len(scene.parts)):
-            where = scene.part_slice(part)
-            pixels = np.arange(where.start, where.stop)
-            if len(pixels) == 0:
-                drafts.append(None)
-                continue
-            probes = np.sort(rng.permutation(pixels)[: self.PROBES])
-            subset = np.sort(rng.permutation(pixels)[: self.TRAINING_ROWS])
-            mix = self._combinations(
-                torch.from_numpy(self.operator.rows(subset)), tables, importance
-            )
-            images = []
-            for chunk in _chunks(pixels):
-                images.append(self.operator.images(chunk, mix))
-                done += len(chunk)
-                report("basis images", done / total)
-            whole = torch.cat(images, dim=1)
-            damping = _damping(whole, len(subset))
-            basis = _orthonormal(whole * damping)
-            fit, weight = self._fit_pixels(basis, pixels, rng)
-            rows = self.operator.rows(fit)
-            exact = self.operator.rows(probes, 2.0 * resolution)
-            drafts.append(_Draft(pixels, basis, damping, fit, weight, rows, probes, exact))
-        # cells that none of these pixels sees are neither decoded nor stored
-        seen = np.zeros(grid.size, bool)
-        for draft in drafts:
-            if draft is not None:
-                seen |= (draft.rows != 0.0).any(axis=(0, 1))
-                seen |= (draft.exact != 0.0).any(axis=(0, 1))
-        self.cells = np.flatnonzero(seen)
-        """(n,) flat indices of the table cells that the scene can see."""
+        self.grey = _is_grey(scene)
+        """Whether all light is grey, so that one channel of the basis serves all three."""
         self.parts: list[_PartBasis | None] = []
-        for i, draft in enumerate(drafts):
-            self.parts.append(None if draft is None else self._compress(draft))
-            drafts[i] = None
-            report("least squares", (i + 1) / len(drafts))
+        self._operator: Operator | None = None
+        self._probe_operator: Operator | None = None
+        backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
+        self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop)).to(self.device)
 
-    def _fit_pixels(
+    @property
+    def operator(self) -> Operator:
+        """The uncompressed operator."""
+        if self._operator is None:
+            self._operator = Operator(self.scene, self.grid, self.resolution)
+        return self._operator
+
+    @property
+    def _exact(self) -> Operator:
+        """The operator of the probes, at twice the resolution."""
+        if self._probe_operator is None:
+            tree = self.operator.tree
+            self._probe_operator = Operator(self.scene, self.grid, 2.0 * self.resolution, tree)
+        return self._probe_operator
+
+    def _compress(
         self,
-        basis: torch.Tensor,
-        pixels: NDArray[np.int64],
+        part: int,
+        tables: torch.Tensor,
+        importance: torch.Tensor,
         rng: np.random.Generator,
-    ) -> tuple[NDArray[np.int64], Float64]:
-        """Pixels and weights of the least-squares fit: a third by leverage, the rest by chance."""
-        count = min(self.FIT_FACTOR * basis.shape[-1], len(pixels))
+        report: Progress,
+    ) -> _PartBasis:
+        operator = self.operator
+        span = self.scene.part_slice(part)
+        fragments = np.arange(span.start, span.stop)
+        operator.prepare(part, report)
+        probes = np.sort(rng.permutation(fragments)[: self.PROBES])
+        subset = np.sort(rng.permutation(fragments)[: self.TRAINING_ROWS])
+        mix, need = self._combinations(operator.rows(subset), tables, importance)
+        images = torch.from_numpy(operator.part_images(part, mix, report))
+        colours = 1 if self.grey else 3
+        whole = images.permute(1, 0, 2)[:colours].contiguous()
+        del images
+        damping = _damping(whole, len(subset))
+        basis = _sorted_basis(whole * damping, need, self.rank, self.ENOUGH)
+        del whole
+        exact = self._exact.rows(probes)[:, :colours]
+        return self._assemble(part, basis, damping, probes, exact, rng)
+
+    def _combinations(
+        self, rows: Float32, tables: torch.Tensor, importance: torch.Tensor
+    ) -> tuple[Float32, Float64]:
+        """M = X Y Sigma^-1 (cells, R) for rows (m, 3, cells) of the subset, and Sigma (R,).
+
+        One M serves the three colours, so R is a quarter more than the rank.
+        """
+        colours = 1 if self.grey else 3
+        stacked = torch.from_numpy(rows[:, :colours].reshape(-1, rows.shape[-1]))
+        images = (stacked @ tables).double()
+        scale = images.mean(dim=0)
+        lit = scale > 0.0
+        weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
+        images = images * weight
+        # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
+        squares, u = _eigh(images @ images.T)
+        count = min(self.rank if self.grey else self.rank + self.rank // 4, len(squares))
+        enough = squares.flip(0) > (0.3 * self.ENOUGH) ** 2 * squares[-1]
+        count = max(1, min(count, int(enough.sum())))
+        squares, u = squares.flip(0)[:count], u.flip(1)[:, :count]
+        keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
+        inverse = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
+        mix = weight[:, None] * (images.T @ u) * inverse
+        need = torch.where(keep, squares, 0.0).sqrt().numpy()
+        return (tables @ mix.float()).numpy(), need
+
+    def _assemble(
+        self,
+        part: int,
+        basis: torch.Tensor,
+        damping: torch.Tensor,
+        probes: Int64,
+        exact: Float32,
+        rng: np.random.Generator,
+    ) -> _PartBasis:
+        """The part's C by weighted least squares, and everything a frame reads."""
+        scene, colours = self.scene, len(basis)
+        span = scene.part_slice(part)
+        chosen, importance = self._fit_rows(basis, span.stop - span.start, rng)
+        rows = torch.from_numpy(self.operator.rows(chosen + span.start)[:, :colours])
+        seen = (rows != 0.0).any(dim=0).any(dim=0)
+        seen |= torch.from_numpy((exact != 0.0).any(axis=(0, 1)))
+        cells = torch.nonzero(seen)[:, 0]
+        weight = torch.from_numpy(importance)[:, None]
+        at = torch.from_numpy(chosen)
+        sampled = basis[:, at].double() * weight
+        damped = (damping[:, at] * weight).transpose(1, 2)
+        squares, vectors = _eigh(sampled.transpose(1, 2) @ sampled)
+        keep = squares > 1e-9 * squares[:, -1:].clamp_min(1e-30)
+        scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
+        inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
+        solve = (inverse @ sampled.transpose(1, 2) * damped).float()
+        shown = basis / damping
+        probe = torch.from_numpy(probes - span.start)
+        move = self.device
+        return _PartBasis(
+            pixels=torch.from_numpy(scene.pixels[span]).to(move),
+            basis=shown.transpose(1, 2).contiguous().to(move),
+            cells=cells.to(move),
+            place=cells.to(move),
+            projection=torch.bmm(solve, rows[:, :, cells].permute(1, 0, 2)).to(move),
+            probe_rows=(
+                torch.from_numpy(exact)[:, :, cells].permute(1, 0, 2).contiguous().to(move)
+            ),
+            probe_basis=shown[:, probe].contiguous().to(move),
+            probes=probe.to(move),
+            mirror=torch.from_numpy(self.operator.mirror(np.arange(span.start, span.stop))).to(
+                move
+            ),
+        )
+
+    def _fit_rows(
+        self, basis: torch.Tensor, size: int, rng: np.random.Generator
+    ) -> tuple[Int64, Float64]:
+        """Fragments and weights of the least-squares fit: a third by leverage, others by chance."""
+        count = min(self.FIT_FACTOR * basis.shape[-1], size)
         leverage = (basis.double() ** 2).sum(dim=(0, 2)).numpy()
         order = np.argsort(-leverage, kind="stable")
         leading, others = order[: count // 3], order[count // 3 :]
         drawn = rng.choice(others, count - len(leading), replace=False)
         chosen = np.concatenate([leading, drawn])
-        # each drawn pixel speaks for its share of the pixels that were not taken for leverage
+        # each drawn one speaks for its share of those that were not taken for leverage
         share = math.sqrt(len(others) / max(len(drawn), 1))
         weight = np.concatenate([np.ones(len(leading)), np.full(len(drawn), share)])
         ascending = np.argsort(chosen)
-        return pixels[chosen[ascending]], weight[ascending]
+        return chosen[ascending], weight[ascending]
 
-    def _combinations(
-        self, rows: torch.Tensor, tables: torch.Tensor, importance: torch.Tensor
-    ) -> torch.Tensor:
-        """M = X Y Sigma^-1 (3, cells, r) for the rows (m, 3, cells) of the subset."""
-        combinations = []
-        for c in range(3):
-            images = (rows[:, c] @ tables).double()
-            scale = images.mean(dim=0)
-            lit = scale > 0.0
-            weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
-            images = images * weight
-            # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
-            squares, u = _eigh(images @ images.T)
-            rank = min(self.rank, len(squares))
-            squares, u = squares.flip(0)[:rank], u.flip(1)[:, :rank]
-            keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
-            inverse = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
-            mix = weight[:, None] * (images.T @ u) * inverse
-            combinations.append(tables @ mix.float())
-        return torch.stack(combinations)
+    def _join_cells(self) -> None:
+        """Gather the cells that any part sees: the others are neither decoded nor stored."""
+        seen = torch.zeros(self.grid.size, dtype=torch.bool, device=self.device)
+        for basis in self.parts:
+            if basis is not None:
+                seen[basis.cells] = True
+        self.cells = torch.nonzero(seen)[:, 0].cpu().numpy()
+        """(n,) flat indices of the table cells that the scene can see."""
+        place = torch.cumsum(seen, dim=0) - 1
+        for basis in self.parts:
+            if basis is not None:
+                basis.place = place[basis.cells]
 
-    def _compress(self, draft: _Draft) -> _PartBasis:
-        pixels, basis, scene = draft.pixels, draft.basis, self.scene
-        seen = torch.from_numpy(self.cells)
-        weight = torch.from_numpy(draft.weight)[:, None]
-        at = torch.from_numpy(draft.fit - pixels[0])
-        sampled = basis[:, at].double() * weight
-        damped = (draft.damping[:, at] * weight).transpose(1, 2)
-        shown = basis / draft.damping
-        gram = sampled.transpose(1, 2) @ sampled
-        squares, vectors = _eigh(gram)
-        keep = squares > 1e-9 * squares[:, -1:].clamp_min(1e-30)
-        scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
-        inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
-        solve = (inverse @ sampled.transpose(1, 2) * damped).float()
-        rows = torch.from_numpy(draft.rows)[:, :, seen].permute(1, 0, 2)
-        mirror = scene.environment.radiance(reflect(scene.views[pixels], scene.normals[pixels]))
-        move = self.device
-        return _PartBasis(
-            pixels=torch.from_numpy(scene.pixels[pixels]).to(move),
-            basis=shown.transpose(1, 2).contiguous().to(move),
-            projection=torch.bmm(solve, rows).to(move),
-            probe_rows=(
-                torch.from_numpy(draft.exact)[:, :, seen].permute(1, 0, 2).contiguous().to(move)
-            ),
-            probe_basis=shown[:, torch.from_numpy(draft.probes - pixels[0])].contiguous().to(move),
-            mirror=torch.from_numpy(np.ascontiguousarray(mirror)).to(move),
-        )
+    def train(self, part: int, radiance: torch.Tensor) -> None:
+        """Take an image into a part's basis, so that tables like its own are shown by it.
+
+        Parameters
+        ----------
+        part : index into ``scene.parts``
+        radiance : (P, 3) the part's fragments under some table, as `shade_exactly` has them
+        """
+        known = self.parts[part]
+        if known is None:
+            return
+        span = self.scene.part_slice(part)
+        if radiance.shape != (span.stop - span.start, 3):
+            raise ValueError(
+                f"radiance: expected ({span.stop - span.start}, 3), got {tuple(radiance.shape)}"
+            )
+        colours = len(known.basis)
+        fresh = (radiance.T if colours == 3 else radiance.T.mean(dim=0, keepdim=True)).cpu()
+        images = torch.cat([known.basis.cpu().transpose(1, 2), fresh[:, :, None]], dim=2)
+        # the image counts as much as a basis image does
+        images[:, :, -1] /= images[:, :, -1].norm(dim=1, keepdim=True).clamp_min(1e-30)
+        damping = _damping(images, images.shape[1])
+        basis = _orthonormal(images * damping)
+        probes = known.probes.cpu().numpy() + span.start
+        exact = np.zeros((len(probes), colours, self.grid.size), np.float32)
+        exact[:, :, known.cells.cpu().numpy()] = known.probe_rows.cpu().permute(1, 0, 2).numpy()
+        rng = np.random.default_rng(basis.shape[-1])
+        self.parts[part] = self._assemble(part, basis, damping, probes, exact, rng)
+        self._join_cells()
+
+    # -- files ----------------------------------------------------------------------------------
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that was prepared, as arrays: `restored` makes an equal transport of them."""
+        known: dict[str, NDArray[Any]] = {
+            "rank": np.array(self.rank),
+            "resolution": np.array(self.resolution),
+        }
+        for i, part in enumerate(self.parts):
+            if part is not None:
+                for name in _STORED:
+                    known[f"{name}_{i}"] = getattr(part, name).cpu().numpy()
+        return known
+
+    @classmethod
+    def restored(
+        cls,
+        scene: Scene,
+        grid: HalfDiffGrid,
+        arrays: Mapping[str, NDArray[Any]],
+        device: str | torch.device = "cpu",
+    ) -> Transport:
+        """The transport of `arrays` for the scene and grid that it was prepared for.
+
+        Raises
+        ------
+        ValueError
+            If an array is missing or of a wrong shape or type.
+        """
+        self = cls.__new__(cls)
+        rank, resolution = (np.asarray(arrays.get(name)) for name in ("rank", "resolution"))
+        if rank.shape != () or rank.dtype.kind != "i" or resolution.dtype.kind != "f":
+            raise ValueError("arrays: expected a rank and a resolution")
+        self._begin(scene, grid, int(rank), float(resolution), device)
+        colours = 1 if self.grey else 3
+        for i in range(len(scene.parts)):
+            span = scene.part_slice(i)
+            size = span.stop - span.start
+            if size == 0:
+                self.parts.append(None)
+                continue
+            part = {name: np.asarray(arrays.get(f"{name}_{i}")) for name in _STORED}
+            (r, n, m) = (
+                part["basis"].shape[1] if part["basis"].ndim == 3 else -1,
+                len(part["cells"]) if part["cells"].ndim == 1 else -1,
+                len(part["probes"]) if part["probes"].ndim == 1 else -1,
+            )
+            shapes = {
+                "pixels": (size,), "basis": (colours, r, size), "cells": (n,),
+                "projection": (colours, r, n), "probe_rows": (colours, m, n),
+                "probe_basis": (colours, m, r), "probes": (m,), "mirror": (size, 3),
+            }  # fmt: skip
+            for name, shape in shapes.items():
+                value = part[name]
+                kind = "i" if name in ("pixels", "cells", "probes") else "f"
+                if value.shape != shape or value.dtype.kind != kind:
+                    raise ValueError(
+                        f"arrays: expected {name}_{i} of shape {shape}, got {value.shape} "
+                        f"{value.dtype}"
+                    )
+            limits = {"cells": grid.size, "probes": size}
+            within = all(
+                part[name].size == 0 or (part[name].min() >= 0 and part[name].max() < limit)
+                for name, limit in limits.items()
+            )
+            if not within or not np.array_equal(part["pixels"], scene.pixels[span]):
+                raise ValueError("arrays: expected those of this scene, got other pixels or cells")
+            tensors = {name: torch.from_numpy(v).to(self.device) for name, v in part.items()}
+            self.parts.append(_PartBasis(**tensors, place=tensors["cells"]))
+        self._join_cells()
+        return self
 
     @property
     def bytes(self) -> int:
@@ -399,10 +510,27 @@ class Transport:
             for t in (p.basis, p.projection, p.probe_rows, p.probe_basis)
         )
 
+    # -- frames ---------------------------------------------------------------------------------
+
+    def radiance(self, part: int, table: torch.Tensor) -> torch.Tensor:
+        """(P, 3) of a part's fragments, not clamped: linear in `table`, for gradients.
+
+        Parameters
+        ----------
+        part : index into ``scene.parts``
+        table : (len(cells), 3) float32 f_r at the cells that the scene sees
+        """
+        self._check_table(table)
+        known = self.parts[part]
+        if known is None:
+            return torch.zeros((0, 3), device=self.device)
+        coefficients = _per_colour(known.projection, table[known.place].T)
+        return _per_colour(known.basis.transpose(1, 2), coefficients).T
+
     def shade(
         self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
     ) -> PartFrame:
-        """Linear radiance of one part's pixels, and its error measured on the probes.
+        """Linear radiance of one part's fragments, and its error measured on the probes.
 
         Parameters
         ----------
@@ -411,14 +539,12 @@ class Transport:
             f_r at the cells that the scene sees.
         mirror : (3,) weight of a perfect mirror
         """
-        if table.shape != (len(self.cells), 3):
-            raise ValueError(f"table: expected ({len(self.cells)}, 3), got {tuple(table.shape)}")
+        self._check_table(table)
         known = self.parts[part]
         if known is None:
             empty = torch.zeros((0, 3), device=self.device)
             return PartFrame(empty, 0.0, 0.0)
-        columns = table.T.contiguous()
-        # colour by colour: a batched product of matrices with vectors is four times slower
+        columns = table[known.place].T.contiguous()
         coefficients = _per_colour(known.projection, columns)
         exact = _per_colour(known.probe_rows, columns)
         shown = _per_colour(known.probe_basis, coefficients).clamp_min(0.0)
@@ -429,30 +555,41 @@ class Transport:
             pixels = pixels + mirror * known.mirror
         return PartFrame(pixels, deviation, level)
 
+    def _check_table(self, table: torch.Tensor) -> None:
+        if table.shape != (len(self.cells), 3):
+            raise ValueError(f"table: expected ({len(self.cells)}, 3), got {tuple(table.shape)}")
+
     def shade_exactly(
-        self, part: int, table: Float32, mirror: torch.Tensor | None = None
+        self,
+        part: int,
+        table: Float32,
+        mirror: torch.Tensor | None = None,
+        progress: Progress | None = None,
     ) -> PartFrame:
         """The same by the uncompressed operator: slow, for tables outside the basis.
 
-        `table` is (grid.size, 3).
+        `table` is (grid.size, 3). The error is measured on the probes as well.
         """
         if table.shape != (self.grid.size, 3):
             raise ValueError(f"table: expected ({self.grid.size}, 3), got {table.shape}")
-        scene = self.scene
-        pixels = np.arange(len(scene.pixels))[scene.part_slice(part)]
-        columns = torch.from_numpy(np.ascontiguousarray(table.T[:, :, None]))
-        radiance = self.operator.images(pixels, columns)[..., 0].T.to(self.device)
+        images = self.operator.part_images(part, table, progress)
+        radiance = torch.from_numpy(np.einsum("pcc->pc", images).copy()).to(self.device)
         known = self.parts[part]
-        if known is not None and mirror is not None:
+        if known is None:
+            return PartFrame(radiance, 0.0, 0.0)
+        columns = torch.from_numpy(table).to(self.device)[known.cells].T.contiguous()
+        exact = _per_colour(known.probe_rows, columns).T
+        shown = radiance[known.probes]
+        if mirror is not None:
             radiance = radiance + mirror * known.mirror
-        return PartFrame(radiance, 0.0, float(radiance.mean()) if len(pixels) else 0.0)
+        return PartFrame(radiance, float((shown - exact).abs().mean()), float(exact.mean()))
 
     def compose(self, frames: list[PartFrame]) -> torch.Tensor:
         """The frame (H, W, 3): the parts over the backdrop."""
         image = self._backdrop.clone()
         for part, frame in zip(self.parts, frames, strict=True):
             if part is not None:
-                image.index_copy_(0, part.pixels, frame.radiance)
+                image.index_add_(0, part.pixels, frame.radiance)
         return image.reshape(self.scene.height, self.scene.width, 3)
 
     def frame_error(self, frames: list[PartFrame]) -> float:
@@ -463,9 +600,83 @@ class Transport:
         return deviation / level if level > 0.0 else deviation
 
 
+class Draft:
+    """A scene's frames at a small size, straight from the operator: for what is not prepared.
+
+    Parameters
+    ----------
+    scene : Scene at its full size
+    grid : HalfDiffGrid of the tables
+    size : int
+        Pixels along the longer side; the scene's own where that is smaller.
+    resolution : float
+        As for `Operator`: coarse light makes a first image in a fraction of a second.
+    tree : LightTree of the scene's map, if it is at hand
+    seed : chooses the probes
+    """
+
+    PROBES = 24
+
+    def __init__(
+        self,
+        scene: Scene,
+        grid: HalfDiffGrid,
+        size: int = 128,
+        resolution: float = 0.6,
+        tree: LightTree | None = None,
+        seed: int = 0,
+    ) -> None:
+        scale = min(1.0, size / max(scene.height, scene.width))
+        shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
+        self.scene = scene.changed(size=shape, subsamples=min(4, scene.subsamples))
+        self.operator = Operator(self.scene, grid, resolution, tree)
+        count = len(self.scene.pixels)
+        rng = np.random.default_rng(seed)
+        self._probes = np.sort(rng.permutation(count)[: self.PROBES])
+        exact = Operator(self.scene, grid, 2.0 * resolution, self.operator.tree)
+        self._rows = exact.rows(self._probes)
+
+    def render(
+        self, tables: Sequence[Float32], mirrors: Sequence[Float64] | None = None
+    ) -> tuple[Float32, float]:
+        """The small frame (h, w, 3) for one table (grid.size, 3) a part, and its measured error."""
+        scene = self.scene
+        radiance = np.zeros((len(scene.pixels), 3), np.float32)
+        exact = np.zeros((len(self._probes), 3))
+        for part, table in enumerate(tables):
+            span = scene.part_slice(part)
+            images = self.operator.part_images(part, table)
+            radiance[span] = np.einsum("pcc->pc", images)
+            mine = (self._probes >= span.start) & (self._probes < span.stop)
+            exact[mine] = np.einsum("mck,kc->mc", self._rows[mine], table)
+        level = float(exact.mean()) if exact.size else 0.0
+        deviation = np.abs(radiance[self._probes] - exact).mean() if exact.size else 0.0
+        if mirrors is not None and any(np.any(m) for m in mirrors):
+            weight = np.stack([np.asarray(m) for m in mirrors])[scene.pixel_part]
+            radiance += weight * self.operator.mirror(np.arange(len(scene.pixels)))
+        image = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
+        np.add.at(image, scene.pixels, radiance)
+        frame = image.reshape(scene.height, scene.width, 3).astype(np.float32)
+        return frame, float(deviation / level) if level > 0.0 else float(deviation)
+
+
 def _per_colour(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """(3, a, b) times (3, b), colour by colour."""
+    """(C, a, b) times (3, b), colour by colour; one matrix (C = 1) serves all three."""
+    if len(matrices) == 1:
+        return (matrices[0] @ vectors.T).T
+    # a batched product of matrices with vectors is four times slower
     return torch.stack([torch.mv(matrices[c], vectors[c]) for c in range(3)])
+
+
+def _is_grey(scene: Scene) -> bool:
+    image = scene.environment.image
+    colours = [np.asarray(c) for light in scene.lights for c in [_colour(light)]]
+    same = bool((image[..., 1:] == image[..., :1]).all())
+    return same and all(bool((c == c[0]).all()) for c in colours)
+
+
+def _colour(light: Light) -> tuple[float, float, float]:
+    return light.intensity if isinstance(light, PointLight) else light.irradiance
 
 
 def _eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -509,215 +720,20 @@ def _orthonormal(images: torch.Tensor) -> torch.Tensor:
     return basis
 
 
-def _pack(tree: LightTree) -> Float32:
-    """(n, 16) float32: all that the walk reads of a node, in one line of cache."""
-    nodes = np.zeros((len(tree.radius), 16), np.float32)
-    nodes[:, :3] = tree.direction
-    nodes[:, 3] = tree.radius
-    nodes[:, 4] = tree.spread**2
-    nodes[:, 5:14] = tree.moment.reshape(-1, 9)
-    return nodes
+def _sorted_basis(images: torch.Tensor, need: Float64, rank: int, enough: float) -> torch.Tensor:
+    """An orthonormal basis (C, P, r) of images (C, P, R), what is needed most first.
 
-
-def _chunks(index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return [index[i : i + _ROWS_AT_ONCE] for i in range(0, len(index), _ROWS_AT_ONCE)]
-
-
-# The walk below is the one loop that torch cannot express: a tree descent for each pixel. Numba
-# compiles it; everything that runs while a user paints is torch, on any device.
-
-
-@numba.njit(cache=True, inline="always")
-def _arctan(y: Any, x: Any) -> Any:
-    """atan2 in the first quadrant, to 2e-6 of the angle (Abramowitz & Stegun 4.4.49)."""
-    t = min(x, y) / max(max(x, y), 1e-300)
-    s = t * t
-    a = -0.0040540580
-    for c in (
-        0.0218612288, -0.0559098861, 0.0964200441, -0.1390853351, 0.1994653599, -0.3332985605,
-        0.9999993329,
-    ):  # fmt: skip
-        a = a * s + c
-    a *= t
-    return a if y <= x else 0.5 * math.pi - a
-
-
-@numba.njit(cache=True, inline="always")
-def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any, texel: Any) -> Any:
-    """Put the quarters of a piece of a texel on the stack `cells`; returns its new top."""
-    tm, fm = 0.5 * (t0 + t1), 0.5 * (f0 + f1)
-    for a in range(4):
-        top += 1
-        cells[top, 0] = t0 if a < 2 else tm
-        cells[top, 1] = tm if a < 2 else t1
-        cells[top, 2] = f0 if a % 2 == 0 else fm
-        cells[top, 3] = fm if a % 2 == 0 else f1
-        cells[top, 4] = texel
-    return top
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _coarse_irradiance(n: Any, nodes: Any, child: Any, stack: Any) -> Any:
-    """Irradiance (summed over colours) to some percent: what bright nodes are measured against."""
-    total = 0.0
-    top = 0
-    stack[0] = 0
-    while top >= 0:
-        i = stack[top]
-        top -= 1
-        cos_i = n[0] * nodes[i, 0] + n[1] * nodes[i, 1] + n[2] * nodes[i, 2]
-        r = nodes[i, 3]
-        if r > 0.2 and (child[i, 0] >= 0 or child[i, 1] >= 0):
-            for s in range(2):
-                if child[i, s] >= 0:
-                    top += 1
-                    stack[top] = child[i, s]
-        elif cos_i > 0.0:
-            for c in range(3):
-                total += max(
-                    0.0,
-                    n[0] * nodes[i, 5 + 3 * c]
-                    + n[1] * nodes[i, 6 + 3 * c]
-                    + n[2] * nodes[i, 7 + 3 * c],
-                )
-    return max(total, 1e-30)
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True)
-def _fill_row(
-    row: Any, n: Any, v: Any,
-    nodes: Any, child: Any, rectangle: Any, image: Any,
-    n_h: Any, n_d: Any, n_p: Any, relative: Any, brightest: Any, horizon: Any, widest: Any,
-    stack: Any, cells: Any,
-) -> None:  # fmt: skip
-    """Add one pixel's weights to `row` (3, cells).
-
-    A node is used whole where its reach in half-vector space is at most `relative` times its
-    distance from the mirror peak, it carries at most the share `brightest` of the irradiance or
-    is accordingly smaller, it is no wider than `widest`, and, if the horizon cuts it, `horizon`.
+    `need` (R,) says how much of each image the training set takes. At most `rank` columns, and
+    none that carries less than the share `enough` of the largest.
     """
-    half_pi = 0.5 * math.pi
-    t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
-    total = _coarse_irradiance(n, nodes, child, stack)
-    top = 0
-    stack[0] = 0
-    piece = -1
-    while top >= 0 or piece >= 0:
-        in_texel = piece >= 0
-        t0 = t1 = f0 = f1 = 0.0
-        if in_texel:
-            t0, t1, f0, f1 = cells[piece, 0], cells[piece, 1], cells[piece, 2], cells[piece, 3]
-            i = int(cells[piece, 4])
-            piece -= 1
-            tm, fm = 0.5 * (t0 + t1), 0.5 * (f0 + f1)
-            st = math.sin(tm)
-            cx, cy, cz = -st * math.sin(fm), math.cos(tm), st * math.cos(fm)
-            cos_i = n[0] * cx + n[1] * cy + n[2] * cz
-            e = 2.0 * st * math.sin(0.5 * (t1 - t0)) * (f1 - f0) * cos_i
-            at_row, at_column = rectangle[i, 0], rectangle[i, 2]
-            e0 = image[at_row, at_column, 0] * e
-            e1 = image[at_row, at_column, 1] * e
-            e2 = image[at_row, at_column, 2] * e
-            r = 0.5 * math.sqrt((t1 - t0) ** 2 + (st * (f1 - f0)) ** 2)
-            variance = r * r / 6.0
-        else:
-            i = stack[top]
-            top -= 1
-            cx, cy, cz = nodes[i, 0], nodes[i, 1], nodes[i, 2]
-            cos_i = n[0] * cx + n[1] * cy + n[2] * cz
-            e0 = n[0] * nodes[i, 5] + n[1] * nodes[i, 6] + n[2] * nodes[i, 7]
-            e1 = n[0] * nodes[i, 8] + n[1] * nodes[i, 9] + n[2] * nodes[i, 10]
-            e2 = n[0] * nodes[i, 11] + n[1] * nodes[i, 12] + n[2] * nodes[i, 13]
-            r = nodes[i, 3]
-            variance = nodes[i, 4]
-        # the centroid may lie in a corner: everything is within 2 r of it
-        if cos_i < -2.0 * r:
-            continue
-        hx, hy, hz = cx + v[0], cy + v[1], cz + v[2]
-        length = math.sqrt(hx * hx + hy * hy + hz * hz)
-        scale = 1.0 / max(length, 1e-6)
-        hx *= scale
-        hy *= scale
-        hz *= scale
-        px, py, pz = hy * n[2] - hz * n[1], hz * n[0] - hx * n[2], hx * n[1] - hy * n[0]
-        sin_h = math.sqrt(px * px + py * py + pz * pz)
-        cos_h = hx * n[0] + hy * n[1] + hz * n[2]
-        reach = r / max(length, 0.1)
-        allowed = relative * (max(sin_h - reach, 0.0) + 1e-3)
-        share = (e0 + e1 + e2) / total
-        if share > brightest:
-            allowed *= max(0.25, math.sqrt(brightest / share))
-        if reach > allowed or r > widest or (abs(cos_i) < 2.0 * r and r > horizon):
-            if in_texel:
-                if piece + 4 < cells.shape[0] and r > 1e-5:
-                    piece = _push_quarters(cells, piece, t0, t1, f0, f1, i)
-                    continue
-            elif rectangle[i, 1] - rectangle[i, 0] == 1 and rectangle[i, 3] - rectangle[i, 2] == 1:
-                piece = _push_quarters(
-                    cells, piece,
-                    rectangle[i, 0] * t_step, rectangle[i, 1] * t_step,
-                    rectangle[i, 2] * f_step, rectangle[i, 3] * f_step, i,
-                )  # fmt: skip
-                continue
-            else:
-                for s in range(2):
-                    if child[i, s] >= 0:
-                        top += 1
-                        stack[top] = child[i, s]
-                continue
-        e0, e1, e2 = max(e0, 0.0), max(e1, 0.0), max(e2, 0.0)
-        if cos_i <= 0.0 or e0 + e1 + e2 <= 0.0:
-            continue
-        dx, dy, dz = cx - v[0], cy - v[1], cz - v[2]
-        theta_d = _arctan(math.sqrt(dx * dx + dy * dy + dz * dz), length)
-        theta_h = _arctan(sin_h, max(cos_h, 0.0))
-        across = abs(cx * px + cy * py + cz * pz)
-        along = abs(0.5 * length * cos_h - cos_i)
-        phi_d = _arctan(across, along)
-        y = theta_d / half_pi * (n_d - 1)
-        b0 = min(int(y), n_d - 2)
-        fb = y - b0
-        z = phi_d / half_pi * (n_p - 1)
-        c0 = min(int(z), n_p - 2)
-        fc = z - c0
-        # in the plane of incidence h moves half as far as wi, across it 1 / (2 cos theta_d) as far
-        stretch = 4.0 / max(length * length, 0.01)
-        ss = across * across / max(across * across + along * along, 1e-300)
-        outward = 0.25 * variance * ((1.0 - ss) + ss * stretch)
-        sideways = 0.25 * variance * (ss + (1.0 - ss) * stretch)
-        theta_m = math.sqrt(theta_h * theta_h + sideways)
-        delta = math.sqrt(outward)
-        for side in range(2):
-            th = abs(theta_m - delta) if side == 0 else theta_m + delta
-            th = min(th, half_pi)
-            a0 = min(int(math.sqrt(th / half_pi) * (n_h - 1)), n_h - 2)
-            low = (a0 / (n_h - 1)) ** 2 * half_pi
-            high = ((a0 + 1) / (n_h - 1)) ** 2 * half_pi
-            fa = min(max((th - low) / (high - low), 0.0), 1.0)
-            base = (a0 * n_d + b0) * n_p + c0
-            for a in range(2):
-                wa = 0.5 * (fa if a else 1.0 - fa)
-                for b in range(2):
-                    wb = wa * (fb if b else 1.0 - fb)
-                    for c in range(2):
-                        w = wb * (fc if c else 1.0 - fc)
-                        k = base + (a * n_d + b) * n_p + c
-                        row[0, k] += w * e0
-                        row[1, k] += w * e1
-                        row[2, k] += w * e2
-
-
-@numba.njit(parallel=True, cache=True, error_model="numpy")
-def _fill_rows(
-    out: Any, normals: Any, views: Any,
-    nodes: Any, child: Any, rectangle: Any, image: Any,
-    n_h: Any, n_d: Any, n_p: Any, relative: Any, brightest: Any, horizon: Any, widest: Any,
-) -> None:  # fmt: skip
-    for p in numba.prange(len(normals)):
-        stack = np.empty(256, np.int32)
-        cells = np.empty((256, 5), np.float64)
-        out[p] = 0.0
-        _fill_row(
-            out[p], normals[p], views[p], nodes, child, rectangle,
-            image, n_h, n_d, n_p, relative, brightest, horizon, widest, stack, cells,
-        )  # fmt: skip
+    basis = _orthonormal(images)
+    scale = torch.from_numpy(need)
+    turned, sizes = [], []
+    for q, w in zip(basis, images, strict=True):
+        taken = (q.T @ w).double() * scale
+        squares, vectors = _eigh(taken @ taken.T)
+        turned.append(q @ vectors.flip(1)[:, :rank].float())
+        sizes.append(squares.flip(0)[:rank].clamp_min(0.0).sqrt())
+    share = torch.stack(sizes).max(dim=0).values
+    kept = int((share > enough * share[0]).sum())
+    return torch.stack(turned)[:, :, : max(kept, 1)].contiguous()

@@ -1,0 +1,1405 @@
+"""Rows of the transport operator: the light that reaches a pixel, cut into leaves of one tree.
+
+For one pixel I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d): linear in the table's
+cells. A *leaf* is a piece of the environment map with its exact vector irradiance. `Operator`
+turns leaves into rows (a weight for every cell) or, far cheaper, into images of given tables.
+
+*Leaves.* The map is walked as a tree (`lights.LightTree`): a node of light stands for its texels
+where it looks small from the mirror peak, measured in half-vector space; a texel that looks large
+is cut further. A node's irradiance is exact, and its own extent is carried into theta_h to second
+order (two samples one standard deviation apart), so the error falls with the fourth power of the
+node size while the number of nodes grows with its inverse square.
+
+*Shadows.* A cut through the tree, some thousand nodes of little light each, gets one shadow ray a
+node (`VisibilityCut`), bright lights down to single texels. Neighbouring pixels see nearly the same
+occluders: rays are cast on a coarse lattice of pixels, and between lattice points only where those
+around disagree. Near the mirror direction, where a glossy surface shows the occluder's outline,
+leaves at that outline cast their own rays.
+
+*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel: they are
+computed on the lattice and interpolated, wherever normals and shadows vary linearly over its
+cells; elsewhere, and for the narrow rest, every pixel is computed. The two are separated by a
+smooth window over theta_h, so their sum is exact.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from traitbrdf.brdf import HalfDiffGrid
+from traitbrdf.directions import reflect
+from traitbrdf.lights import LightTree, turn_about_y
+from traitbrdf.scene import Scene
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the fraction done; may raise to cancel."""
+
+_SPLIT = (0.15, 0.35)
+"""theta_h in radians between which the window passes from near to far."""
+_OUTLINE = 0.05
+"""theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
+_LEVELS = (4, 2)
+"""Spacing in pixels of the lattices on which far images are computed."""
+_BEND = (0.006, 0.12)
+"""Most that a normal departs from its cell's corners': from their mean, and from any."""
+_UNEVEN = 0.02
+"""Most that a cell's corners differ in what light they see: see `_disagreement`."""
+_QUESTIONS = 192
+"""Most rays of its own that a sample casts at occluders' outlines."""
+_ALL = (-1.0, 9.0)
+_SHARED = ((4, 0.002), (2, 0.007))
+"""Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
+
+f32 = np.float32
+
+
+@dataclass(frozen=True)
+class VisibilityCut:
+    """Nodes of a light tree whose visibility is one bit each.
+
+    Attributes
+    ----------
+    first, last : (n,) int32
+        The cut nodes under (or above) every node of the tree are `first` to `last - 1`.
+    directions : (D, 3) float64, towards the light, in the map's frame
+    share : (D,) float64, of all flux
+    neighbours : (D, 6) int32, the nearest other directions
+    """
+
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    directions: Float64
+    share: Float64
+    neighbours: NDArray[np.int32]
+
+    @classmethod
+    def build(cls, tree: LightTree, spacing: float = 0.1, share: float = 1 / 300) -> VisibilityCut:
+        """Cut where nodes are no wider than `spacing` and hold no more than `share` of the flux."""
+        flux = np.linalg.norm(tree.moment.sum(axis=1, dtype=np.float64), axis=-1)
+        whole = (tree.child < 0).all(axis=1)
+        total = max(float(flux[whole].sum()), 1e-300)
+        split = ~whole & ((tree.radius > spacing) | (flux > share * total))
+        first, last, cut = _cut_ranges(tree.child, split)
+        directions = tree.direction[cut].astype(np.float64)
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        near = min(7, len(cut))
+        _, nearest = cKDTree(directions).query(directions, k=near)
+        neighbours = np.repeat(np.arange(len(cut), dtype=np.int32)[:, None], 6, axis=1)
+        neighbours[:, : near - 1] = np.asarray(nearest).reshape(len(cut), near)[:, 1:]
+        return cls(first, last, directions, flux[cut] / total, neighbours)
+
+
+class Operator:
+    """Rows of W: what every cell of a table contributes to a fragment of the scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    grid : HalfDiffGrid of the "folded" layout
+    resolution : float
+        1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
+    tree : LightTree of the scene's map, if it is at hand
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        grid: HalfDiffGrid,
+        resolution: float = 1.0,
+        tree: LightTree | None = None,
+    ) -> None:
+        if grid.layout != "folded":
+            raise ValueError(f"grid: expected the 'folded' layout, got {grid.layout!r}")
+        if not (math.isfinite(resolution) and resolution > 0.0):
+            raise ValueError(f"resolution: expected a positive number, got {resolution!r}")
+        self.scene = scene
+        self.grid = grid
+        self.resolution = resolution
+        self.tree = LightTree.build(scene.environment) if tree is None else tree
+        self._nodes = _pack(self.tree)
+        self._image = scene.environment.image
+        scale = 1.0 / resolution
+        rule = np.array([0.5 * scale, scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
+        self._rules = np.stack([rule, rule * (1.6, 2.56, 1.6, 1.6)]).astype(np.float32)
+        self._capacity = int(1600 * resolution**2) + 200
+        to_map = scene.environment.to_map
+        self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
+        self._views = np.ascontiguousarray(to_map(scene.views), np.float32)
+        # the sample that stands for a fragment where one must: the middle one
+        self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
+        self._visibility: _Visibility | None = None
+        if any(scene.casts):
+            cut = VisibilityCut.build(self.tree, 0.1 * scale, scale**2 / 300.0)
+            self._visibility = _Visibility(scene, cut, self._middle)
+        self._plans: dict[int, _Plan] = {}
+
+    # -- single fragments -----------------------------------------------------------------------
+
+    def rows(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
+        at = np.asarray(index, np.int64)
+        out = np.zeros((len(at), 3, self.grid.size), np.float32)
+        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._add_lights(out, at, _NO_TABLES)
+        return out
+
+    def images(self, index: NDArray[np.integer], tables: Float32) -> Float32:
+        """(m, 3, T) radiance of the fragments `index` (m,) under scalar tables (grid.size, T)."""
+        at = np.asarray(index, np.int64)
+        tables = np.ascontiguousarray(tables, np.float32)
+        out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
+        self._shade(out, at, self._mask_rows(at), _ALL, tables)
+        self._add_lights(out, at, tables)
+        return out
+
+    def mirror(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3) what a perfect mirror shows at the fragments `index` (m,)."""
+        scene = self.scene
+        index = np.asarray(index, np.int64)
+        sample, owner, share = scene.samples(index)
+        toward = np.asarray(reflect(scene.views[sample], scene.normals[sample]), np.float64)
+        seen = scene.environment.radiance(toward) * scene.visible(sample, toward)[:, None]
+        out = np.zeros((len(index), 3))
+        np.add.at(out, owner, seen * share[:, None])
+        return out.astype(np.float32)
+
+    # -- whole parts ----------------------------------------------------------------------------
+
+    def part_images(self, part: int, tables: Float32, progress: Progress | None = None) -> Float32:
+        """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
+
+        Far images are interpolated where that is safe: an order of magnitude faster than `images`.
+        """
+        report = progress or (lambda stage, fraction: None)
+        span = self.scene.part_slice(part)
+        index = np.arange(span.start, span.stop)
+        tables = np.ascontiguousarray(tables, np.float32)
+        if len(index) == 0:
+            return np.zeros((0, 3, tables.shape[1]), np.float32)
+        plan = self._plan(part, report)
+        near = np.repeat(_near_window(self.grid), self.grid.shape[1] * self.grid.shape[2])
+        wide = tables * (1.0 - near)[:, None]
+        narrow = tables * near[:, None]
+        coarse = np.zeros((len(plan.computed), 3, tables.shape[1]), np.float32)
+        computed = index[plan.computed]
+        self._shade(
+            coarse, computed, self._own_rows(computed), (_SPLIT[0], 9.0), wide,
+            lambda fraction: report("far images", fraction),
+        )  # fmt: skip
+        out = np.empty((len(index), 3, tables.shape[1]), np.float32)
+        _interpolate(out, coarse, plan.corners, plan.weights)
+        self._shade(
+            out, index, plan.mask_rows, (-1.0, _SPLIT[1]), narrow,
+            lambda fraction: report("near images", fraction),
+        )  # fmt: skip
+        self._add_lights(out, index, tables)
+        return out
+
+    # -- leaves ---------------------------------------------------------------------------------
+
+    def _bundles(self, index: Int64, mask_rows: NDArray[np.int32]) -> _Bundles:
+        """The samples of fragments `index`, in groups that share one walk through the light."""
+        scene = self.scene
+        sample, owner, share = scene.samples(index)
+        count = np.bincount(owner, minlength=len(index))
+        starts = np.concatenate([[0], np.cumsum(count)])
+        normals, views = self._normals[sample], self._views[sample]
+        single = np.flatnonzero(count == 1)
+        x, y = scene.pixels[index] % scene.width, scene.pixels[index] // scene.width
+        part = scene.pixel_part[index].astype(np.int64)
+        group = np.full(len(index), -1, np.int64)  # of fragments of one sample
+        found = 0
+        for side, limit in _SHARED:
+            key = (part[single] * (scene.height + side) + y[single] // side) * (
+                scene.width + side
+            ) + x[single] // side
+            order = np.argsort(key, kind="stable")
+            member = single[order]
+            edge = np.flatnonzero(np.diff(key[order], prepend=-1))
+            if not len(edge):
+                break
+            size = np.diff(edge, append=len(member))
+            alike = _alike(
+                edge, size, normals[starts[member]], views[starts[member]],
+                scene.positions[sample[starts[member]]], mask_rows[member], limit,
+            ) & (size > 1)  # fmt: skip
+            joined = np.repeat(alike, size)
+            group[member[joined]] = found + np.repeat(np.arange(alike.sum()), size[alike])
+            found += int(alike.sum())
+            single = np.sort(member[~joined])
+        # a bundle is a group of fragments, or one fragment, whose samples are a group each
+        alone = group < 0
+        group[alone] = found + np.arange(alone.sum())
+        order = np.argsort(group, kind="stable")
+        sorted_samples, _ = _expand(starts, order)
+        per_fragment = count[order]
+        bundle_of_sample = np.repeat(group[order], per_fragment)
+        own = bundle_of_sample >= found  # each sample its own group
+        fresh = np.diff(bundle_of_sample, prepend=-1) != 0
+        group_edge = np.flatnonzero(fresh | own)
+        group_start = np.append(group_edge, len(sorted_samples))
+        bundle_start = np.append(np.flatnonzero(fresh[group_edge]), len(group_edge))
+        target = owner[sorted_samples]
+        several = (count > 2)[target[group_edge]]
+        return _Bundles(
+            bundle_start, group_start, target, normals[sorted_samples], views[sorted_samples],
+            share[sorted_samples].astype(np.float32), sample[sorted_samples],
+            *_centres(group_start, normals[sorted_samples], views[sorted_samples]),
+            _first_rows(group_start, mask_rows[target]), several,
+        )  # fmt: skip
+
+    def _light(self, window: tuple[float, float]) -> tuple[Any, ...]:
+        """What the walk needs beside the samples: nodes, masks and rules."""
+        low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
+        cut, masks = _NO_CUT, _NO_MASKS
+        if self._visibility is not None:
+            cut = (self._visibility.cut.first, self._visibility.cut.last)
+            masks = self._visibility.prefix
+        return (
+            *self._nodes, self._image, *cut, *masks, self._rules,
+            f32(low), f32(high if high < 1.0 else 9.0), f32(math.sin(_OUTLINE)),
+        )  # fmt: skip
+
+    def _shade(
+        self,
+        out: Float32,
+        index: Int64,
+        mask_rows: NDArray[np.int32],
+        window: tuple[float, float],
+        tables: Float32,
+        report: Callable[[float], None] = lambda fraction: None,
+    ) -> None:
+        """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
+        `tables` (cells, T), or to their rows if there are no tables.
+
+        `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
+        """
+        step = 1 << 13
+        light = self._light(window)
+        for i in range(0, len(index), step):
+            at = slice(i, min(i + step, len(index)))
+            bundles = self._bundles(index[at], mask_rows[at])
+            capacity = self._capacity
+            while len(bundles.several):
+                short = self._shade_some(out[at], bundles, light, tables, capacity)
+                bundles = bundles.take(short)
+                capacity *= 2
+            report(at.stop / len(index))
+
+    def _shade_some(
+        self,
+        out: Float32,
+        bundles: _Bundles,
+        light: tuple[Any, ...],
+        tables: Float32,
+        capacity: int,
+    ) -> NDArray[np.bool_]:
+        """Shade bundles; returns which groups have more leaves than the capacity."""
+        groups = len(bundles.several)
+        short = np.zeros(groups, np.bool_)
+        asked = np.zeros(groups, np.int64)
+        ask = np.empty((groups, _QUESTIONS, 3), np.float32)
+        answers = np.ones((groups, _QUESTIONS), np.uint8)
+        rest = (capacity, *self.grid.shape, tables)
+        _shade(
+            out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
+        )  # fmt: skip
+        again = (asked > 0) & ~short
+        if again.any():
+            toward, which = _questions(ask[again], asked[again])
+            toward = turn_about_y(toward, self.scene.environment.rotation)
+            some = bundles.take(again)
+            # the middle member of a group asks for all
+            middle = (some.group_start[:-1] + some.group_start[1:]) // 2
+            answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
+            answers[which] = self.scene.visible(some.sample[middle][which[0]], toward)
+            count = len(some.several)
+            _shade(
+                out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
+                *some.for_the_walk(), *light, *rest,
+            )  # fmt: skip
+        return short
+
+    def _add_lights(self, out: Float32, index: Int64, tables: Float32) -> None:
+        """Add the point and directional lights, each one leaf a sample."""
+        scene = self.scene
+        step = 1 << 16
+        for light in scene.lights:
+            for i in range(0, len(index), step):
+                at = slice(i, min(i + step, len(index)))
+                sample, owner, share = scene.samples(index[at])
+                toward, irradiance = scene.arriving(light, sample)
+                leaves = np.zeros((len(sample), 13, 1), np.float32)
+                toward = scene.environment.to_map(toward)
+                leaves[:, :3, 0] = toward
+                # the vector irradiance of a light: what faces it fully gets it fully
+                leaves[:, 3:12, 0] = (irradiance[:, :, None] * toward[:, None, :]).reshape(-1, 9)
+                starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
+                _one_leaf(
+                    out[at], starts, self._normals[sample], self._views[sample],
+                    share.astype(np.float32), leaves, *self.grid.shape, tables,
+                )  # fmt: skip
+
+    # -- visibility -----------------------------------------------------------------------------
+
+    def _own_rows(self, index: Int64) -> NDArray[np.int32]:
+        """(m, 4) with each fragment's own visibility row first, -1 where it has none."""
+        rows = np.full((len(index), 4), -1, np.int32)
+        if self._visibility is not None:
+            rows[:, 0] = self._visibility.row_of[index]
+        return rows
+
+    def _mask_rows(self, index: Int64) -> NDArray[np.int32]:
+        """Own rows (m, 4) of any fragments; rays are cast for those that have none yet."""
+        visibility = self._visibility
+        if visibility is None or not len(index):
+            return self._own_rows(index)
+        casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
+        unknown = np.unique(index[casts & (visibility.row_of[index] < 0)])
+        if len(unknown):
+            around = np.full((len(unknown), 4), -1, np.int32)
+            for part, plan in self._plans.items():
+                span = self.scene.part_slice(part)
+                mine = (unknown >= span.start) & (unknown < span.stop)
+                around[mine] = plan.mask_rows[unknown[mine] - span.start]
+            visibility.cast(unknown, around, least=3)
+        return self._own_rows(index)
+
+    def prepare(self, part: int, progress: Progress | None = None) -> None:
+        """Cast a part's rays and find where its far images are computed, if that is not done."""
+        self._plan(part, progress or (lambda stage, fraction: None))
+
+    def _plan(self, part: int, report: Progress) -> _Plan:
+        if part not in self._plans:
+            self._plans[part] = _Plan.make(self.scene, part, self._visibility, report)
+        return self._plans[part]
+
+
+@dataclass(frozen=True)
+class _Bundles:
+    """Samples in groups that share one walk, and groups in bundles that one thread shades.
+
+    `target` says which fragment a sample belongs to: all its samples are in one bundle.
+    """
+
+    bundle_start: Int64  # (B + 1,) into groups
+    group_start: Int64  # (G + 1,) into samples
+    target: Int64  # (n,)
+    normals: Float32  # (n, 3)
+    views: Float32  # (n, 3)
+    share: Float32  # (n,)
+    sample: Int64  # (n,) in the scene
+    middle_normals: Float32  # (G, 3)
+    middle_views: Float32  # (G, 3)
+    spread: Float32  # (G,) how far half vectors against the normals differ within the group
+    masks: NDArray[np.int32]  # (G, 4)
+    several: NDArray[np.bool_]  # (G,) whether the fragment has other groups
+
+    def for_the_walk(self) -> tuple[Any, ...]:
+        return (
+            self.bundle_start, self.group_start, self.target, self.normals, self.views, self.share,
+            self.middle_normals, self.middle_views, self.spread, self.masks, self.several,
+        )  # fmt: skip
+
+    def take(self, groups: NDArray[np.bool_]) -> _Bundles:
+        """These groups alone."""
+        kept = np.flatnonzero(groups)
+        samples, group_start = _expand(self.group_start, kept)
+        bundle = np.repeat(np.arange(len(self.bundle_start) - 1), np.diff(self.bundle_start))[kept]
+        bundle_start = np.append(np.flatnonzero(np.diff(bundle, prepend=-1)), len(kept))
+        return _Bundles(
+            bundle_start, group_start, self.target[samples], self.normals[samples],
+            self.views[samples], self.share[samples], self.sample[samples],
+            self.middle_normals[kept], self.middle_views[kept], self.spread[kept],
+            self.masks[kept], self.several[kept],
+        )  # fmt: skip
+
+
+def _expand(starts: Int64, chosen: Int64) -> tuple[Int64, Int64]:
+    """Members of the `chosen` sets of a list in sets, and where the new sets start."""
+    size = np.diff(starts)[chosen]
+    new = np.concatenate([[0], np.cumsum(size)])
+    members = np.arange(new[-1]) - np.repeat(new[:-1] - starts[chosen], size)
+    return members, new
+
+
+def _alike(
+    edge: Int64,
+    size: Int64,
+    normals: Float32,
+    views: Float32,
+    positions: Float64,
+    masks: NDArray[np.int32],
+    limit: float,
+) -> NDArray[np.bool_]:
+    """Whether the members of each set see the light nearly alike and share their masks."""
+    whose = np.repeat(np.arange(len(edge)), size)
+
+    def away(values: NDArray[Any]) -> tuple[Float64, Float64]:
+        mean = np.add.reduceat(values.astype(np.float64), edge, axis=0) / size[:, None]
+        off = values - mean[whose]
+        return off, np.linalg.norm(off, axis=-1)
+
+    _, turned = away(normals)
+    _, moved = away(views)
+    apart, distance = away(positions)
+    # on one sheet of the surface
+    lifted = np.abs(np.einsum("nk,nk->n", apart, normals)) > 0.3 * distance + 1e-9
+    good = (turned + 0.5 * moved <= limit) & ~lifted
+    masked = masks[:, 0] >= 0
+    highest = np.maximum.reduceat(masks, edge, axis=0)[whose]
+    good &= ~masked | (masks == highest).all(axis=1)
+    answer: NDArray[np.bool_] = np.logical_and.reduceat(good, edge)
+    return answer
+
+
+def _centres(
+    group_start: Int64, normals: Float32, views: Float32
+) -> tuple[Float32, Float32, Float32]:
+    """Mean unit normals and views of groups, and how far their members' half vectors depart."""
+    size = np.diff(group_start)
+    means = []
+    off = np.zeros(len(normals))
+    for values, weight in ((normals, 1.0), (views, 0.5)):
+        mean = np.add.reduceat(values.astype(np.float64), group_start[:-1], axis=0)
+        mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-12)
+        off += weight * np.linalg.norm(values - np.repeat(mean, size, axis=0), axis=-1)
+        means.append(mean.astype(np.float32))
+    spread = np.maximum.reduceat(off, group_start[:-1])
+    spread[size == 1] = 0.0
+    return means[0], means[1], spread.astype(np.float32)
+
+
+def _first_rows(group_start: Int64, masks: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The mask rows of each group: those of any member that has some."""
+    rows: NDArray[np.int32] = np.maximum.reduceat(masks, group_start[:-1], axis=0)
+    return rows
+
+
+def _questions(
+    ask: Float32, asked: Int64
+) -> tuple[Float64, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Unit directions of all questions, and (sample, question) of each."""
+    which = np.nonzero(np.arange(ask.shape[1]) < asked[:, None])
+    toward = ask[which].astype(np.float64)
+    return toward / np.linalg.norm(toward, axis=-1, keepdims=True), which
+
+
+class _Visibility:
+    """One bit for every node of the cut, at the fragments where rays were cast."""
+
+    def __init__(self, scene: Scene, cut: VisibilityCut, middle: Int64) -> None:
+        self.scene = scene
+        self.cut = cut
+        self.toward = turn_about_y(cut.directions, scene.environment.rotation)
+        self.row_of = np.full(len(scene.pixels), -1, np.int32)
+        self.rows = 0
+        self._lock = threading.Lock()  # one thread casts for the next part while another shades
+        self._middle = middle
+        self._bits = np.zeros((0, len(cut.share)), np.uint8)
+        self._prefix = tuple(np.zeros((0, len(cut.share) + 1), np.int16) for _ in range(3))
+
+    @property
+    def bits(self) -> NDArray[np.uint8]:
+        """(rows, D): 0 hidden, 1 visible, 2 below the horizon."""
+        return self._bits[: self.rows]
+
+    @property
+    def prefix(self) -> tuple[NDArray[np.int16], ...]:
+        """Counts (rows, D + 1) of nodes before each that are: hidden; not surely visible; not
+        surely hidden. Sure is a node whose neighbours on the sphere agree with it."""
+        return self._prefix
+
+    def cast(
+        self, index: Int64, around: NDArray[np.int32], least: int, verify: bool = False
+    ) -> None:
+        """Find the bits of fragments `index` (m,), with rays where the `around` (m, 4) disagree.
+
+        Fewer than `least` rows around, and every node above the horizon gets a ray. `verify` casts
+        an eighth of what they agree on, and all of it where that proves them wrong.
+        """
+        normals = self.scene.normals[self._middle[index]]
+        for i in range(0, len(index), 2048):
+            some = slice(i, min(i + 2048, len(index)))
+            bits = np.empty((some.stop - some.start, len(self.cut.share)), np.uint8)
+            _inherit(bits, normals[some], self.toward, self._bits, around[some], least)
+            if verify:
+                inherited = bits[:, ::8].copy()
+                bits[:, ::8][inherited < 2] = 3
+                self._ray(bits, index[some])
+                wrong = ((inherited != bits[:, ::8]) & (inherited < 2)).any(axis=1)
+                bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
+            self._ray(bits, index[some])
+            with self._lock:
+                self._append(bits, index[some])
+
+    def _append(self, bits: NDArray[np.uint8], index: Int64) -> None:
+        need = self.rows + len(index)
+        if need > len(self._bits):
+            size = max(need, 2 * len(self._bits))
+            self._bits = _grown(self._bits, size)
+            self._prefix = tuple(_grown(a, size) for a in self._prefix)
+        rows = slice(self.rows, need)
+        self._bits[rows] = bits
+        _count(bits, self.cut.neighbours, *(a[rows] for a in self._prefix))
+        self.rows = need
+        self.row_of[index] = np.arange(rows.start, rows.stop)
+
+    def _ray(self, bits: NDArray[np.uint8], index: Int64) -> None:
+        """Fill the bits that are 3 by rays from the fragments `index`."""
+        at, node = np.nonzero(bits == 3)
+        bits[at, node] = self.scene.visible(self._middle[index][at], self.toward[node])
+
+
+def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
+    larger = np.zeros((size, array.shape[1]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Where a part's far images are computed, and how the others follow; indices in the part.
+
+    Attributes
+    ----------
+    computed : (K,) fragments whose far images are computed
+    corners : (P, 4) int32 indices into `computed`
+    weights : (P, 4) float32
+    mask_rows : (P, 4) int32 visibility rows around each fragment, -1 for none
+    """
+
+    computed: Int64
+    corners: NDArray[np.int32]
+    weights: Float32
+    mask_rows: NDArray[np.int32]
+
+    @classmethod
+    def make(
+        cls, scene: Scene, part: int, visibility: _Visibility | None, report: Progress
+    ) -> _Plan:
+        span = scene.part_slice(part)
+        count = span.stop - span.start
+        casts = visibility if scene.casts[part] else None
+        pixels = scene.pixels[span]
+        x, y = pixels % scene.width, pixels // scene.width
+        single = ~scene.bordering[span]
+        middle = scene.offsets[:-1][span] + np.diff(scene.offsets)[span] // 2
+        positions, normals = scene.positions[middle], scene.normals[middle]
+        lattice = _Lattice(scene.height, scene.width, x, y, single, positions, normals)
+        everything = np.arange(count)
+        known = np.zeros(count, bool)  # has a visibility row
+        nothing = np.full((count, 4), -1, np.int64)
+
+        def look(some: Int64, around: Int64, least: int = 3, verify: bool = False) -> None:
+            new = ~known[some]
+            some, around = some[new], around[new]
+            if casts is not None and len(some):
+                rows = np.where(around >= 0, casts.row_of[span][around], -1).astype(np.int32)
+                casts.cast(some + span.start, rows, least, verify)
+            known[some] = True
+
+        if casts is not None:
+            coarse = 16
+            on = lattice.on(coarse)
+            look(on, nothing[on])
+            while coarse > _LEVELS[0]:
+                around, _ = lattice.cell(everything, coarse)
+                coarse //= 2
+                on = lattice.on(coarse)
+                look(on, around[on], verify=True)
+                report("shadows", 0.0)
+        sharp = _sharp_bits(scene, span, casts)
+        corners = np.repeat(everything[:, None], 4, axis=1)
+        weights = np.zeros((count, 4))
+        weights[:, 0] = 1.0
+        around = nothing.copy()
+        open_ = everything[single]
+        for level in _LEVELS:
+            on = lattice.on(level)
+            if level != _LEVELS[0]:
+                # only the corners of cells that are still open
+                wanted, _ = lattice.cell(open_, level)
+                on = np.unique(wanted[wanted >= 0])
+                look(on, around[on], 2, verify=True)
+            found, weight = lattice.cell(open_, level)
+            ok = (weight != 0.0).any(axis=1)
+            ok &= _predictable(normals, open_, found, weight)
+            if casts is not None:
+                ok &= _shadows_agree(casts, span, normals, open_, found, sharp)
+            good = open_[ok]
+            corners[good] = np.where(found[ok] >= 0, found[ok], good[:, None])
+            weights[good] = weight[ok]
+            around[open_] = np.where((found >= 0).sum(1)[:, None] >= 2, found, around[open_])
+            open_ = open_[~ok]
+        border = everything[~single]
+        around[border], _ = lattice.cell(border, _LEVELS[0])
+        alone = np.concatenate([open_, border])
+        look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
+        report("shadows", 1.0)
+        corners[alone] = alone[:, None]
+        weights[alone] = (1.0, 0.0, 0.0, 0.0)
+        computed, index = np.unique(corners, return_inverse=True)
+        mask_rows = np.full((count, 4), -1, np.int32)
+        if casts is not None:
+            rows = casts.row_of[span]
+            mask_rows = rows[corners].astype(np.int32)
+            mask_rows[alone, 1:] = -1
+            free = (casts.bits[:, :] == 0).sum(axis=1) == 0
+            # where nothing hides anything around, there is nothing to look up
+            clear = np.where(mask_rows >= 0, free[mask_rows], True).all(axis=1) & single
+            mask_rows[clear] = -1
+        return cls(
+            computed, index.reshape(corners.shape).astype(np.int32),
+            weights.astype(np.float32), mask_rows,
+        )  # fmt: skip
+
+
+class _Lattice:
+    """Fragments of one part by pixel, and the cells of square lattices around them."""
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        x: Int64,
+        y: Int64,
+        single: NDArray[np.bool_],
+        positions: Float64,
+        normals: Float64,
+    ) -> None:
+        self._x, self._y, self._single = x, y, single
+        self._positions, self._normals = positions, normals
+        # a margin on the far sides spares the tests at the frame's edge
+        margin = 32
+        self._at = np.full((height + margin, width + margin), -1, np.int64)
+        inside = np.flatnonzero(single)
+        self._at[y[inside], x[inside]] = inside
+
+    def on(self, spacing: int) -> Int64:
+        """Fragments that are points of the lattice."""
+        mask = self._single & (self._x % spacing == 0) & (self._y % spacing == 0)
+        return np.flatnonzero(mask)
+
+    def cell(self, some: Int64, spacing: int) -> tuple[Int64, Float64]:
+        """Corners (m, 4) of the cells of fragments `some`, -1 where missing, and their weights.
+
+        Bilinear; a plane through three where one is missing; zero where more are.
+        """
+        x0, y0 = self._x[some] // spacing * spacing, self._y[some] // spacing * spacing
+        u = (self._x[some] - x0) / spacing
+        v = (self._y[some] - y0) / spacing
+        step = ((0, 0), (0, spacing), (spacing, 0), (spacing, spacing))
+        corners = np.stack([self._at[y0 + dy, x0 + dx] for dy, dx in step], axis=1)
+        weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1)
+        # a corner on another sheet of the surface, before or behind, is no neighbour
+        apart = self._positions[corners] - self._positions[some, None]
+        off = np.abs(np.einsum("mkc,mc->mk", apart, self._normals[some]))
+        corners[off > 0.25 * np.linalg.norm(apart, axis=-1)] = -1
+        missing = corners < 0
+        lacking = missing.sum(axis=1)
+        # a corner is its two neighbours less the opposite one
+        for k, (a, b, c) in enumerate(((1, 2, 3), (0, 3, 2), (0, 3, 1), (1, 2, 0))):
+            gone = missing[:, k] & (lacking == 1)
+            w = weights[gone, k]
+            weights[gone, a] += w
+            weights[gone, b] += w
+            weights[gone, c] -= w
+            weights[gone, k] = 0.0
+        needed = (missing & (weights > 0.0)).any(axis=1)
+        weights[(lacking > 1) & needed] = 0.0
+        weights[missing] = 0.0
+        return corners, weights
+
+
+def _predictable(normals: Float64, some: Int64, corners: Int64, weights: Float64) -> NDArray[Any]:
+    """Whether normals vary so linearly over a cell that images of wide lobes do."""
+    at = np.where(corners >= 0, corners, some[:, None])
+    around = normals[at]
+    own = normals[some]
+    off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
+    spread = np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
+    answer: NDArray[Any] = (off < _BEND[0]) & (spread < _BEND[1])
+    return answer
+
+
+def _sharp_bits(
+    scene: Scene, span: slice, visibility: _Visibility | None
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
+    """Cut nodes that outshine all others, and whether each fragment sees them, a ray for each."""
+    if visibility is None:
+        return None
+    nodes = np.argsort(-visibility.cut.share)[:4]
+    nodes = nodes[visibility.cut.share[nodes] > 0.03]
+    if not len(nodes):
+        return None
+    sample = scene.offsets[:-1][span] + np.diff(scene.offsets)[span] // 2
+    bits = np.zeros((len(sample), len(nodes)), bool)
+    for k, node in enumerate(nodes):
+        toward = visibility.toward[node]
+        up = np.flatnonzero(scene.normals[sample] @ toward > 0.0)
+        bits[up, k] = scene.visible(sample[up], np.broadcast_to(toward, (len(up), 3)))
+    return nodes, bits
+
+
+def _shadows_agree(
+    visibility: _Visibility,
+    span: slice,
+    normals: Float64,
+    some: Int64,
+    corners: Int64,
+    sharp: tuple[NDArray[np.int64], NDArray[np.bool_]] | None,
+) -> NDArray[np.bool_]:
+    """Whether the corners of a fragment's cell are lit alike."""
+    rows = np.where(corners >= 0, visibility.row_of[span][corners], -1).astype(np.int32)
+    cells, which = np.unique(rows, axis=0, return_inverse=True)
+    first = np.zeros(len(cells), np.int64)
+    first[which.reshape(-1)[::-1]] = np.arange(len(which))[::-1]
+    unlike = np.empty(len(cells), np.float32)
+    _disagreement(
+        unlike, visibility.bits, cells, normals[some[first]],
+        visibility.toward, visibility.cut.share,
+    )  # fmt: skip
+    agree: NDArray[np.bool_] = (unlike < _UNEVEN)[which.reshape(-1)]
+    if sharp is not None:
+        nodes, own = sharp
+        for k, node in enumerate(nodes):
+            bit = visibility.bits[:, node]
+            # a corner below the light's horizon says nothing about its shadow
+            same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
+            agree &= same.all(axis=1)
+    return agree
+
+
+def _near_window(grid: HalfDiffGrid) -> Float32:
+    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 over `_SPLIT`."""
+    t = np.clip((grid.theta_h - _SPLIT[0]) / (_SPLIT[1] - _SPLIT[0]), 0.0, 1.0)
+    return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
+
+
+def _pack(tree: LightTree) -> tuple[NDArray[Any], ...]:
+    """What the walk reads of a node, by how often: place and size, irradiance, children."""
+    place = np.zeros((len(tree.radius), 8), np.float32)
+    place[:, :3] = tree.direction
+    place[:, 3] = tree.radius
+    place[:, 4] = tree.spread**2
+    moment = np.zeros((len(tree.radius), 12), np.float32)
+    moment[:, :9] = tree.moment.reshape(-1, 9)
+    box = tree.rectangle
+    texel = (box[:, 1] - box[:, 0] == 1) & (box[:, 3] - box[:, 2] == 1)
+    child = np.where(texel[:, None], -2, tree.child).astype(np.int32)
+    return place, moment, child, box
+
+
+_NO_TABLES = np.zeros((1, 0), np.float32)
+_UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
+
+_NO_CUT = (np.zeros(1, np.int32), np.zeros(1, np.int32))
+_NO_MASKS = tuple(np.zeros((1, 2), np.int16) for _ in range(3))
+
+
+# The loops below are what torch cannot express: tree descents, and sums over lists of uneven
+# length. Numba compiles them; everything that runs while a user paints is torch, on any device.
+
+
+@numba.njit(cache=True, nogil=True)
+def _cut_ranges(child: Any, split: Any) -> Any:
+    """Ranges of cut nodes under every node, in the order of a descent, and the cut itself."""
+    n = len(child)
+    first = np.zeros(n, np.int32)
+    last = np.zeros(n, np.int32)
+    cut = np.empty(n, np.int64)
+    stack = np.empty(1024, np.int64)
+    inside = np.empty(1024, np.bool_)
+    found = 0
+    top = 0
+    stack[0] = 0
+    inside[0] = False
+    done = np.zeros(n, np.bool_)
+    while top >= 0:
+        i, below = stack[top], inside[top]
+        if done[i]:  # its children are through
+            last[i] = found
+            top -= 1
+            continue
+        first[i] = found - 1 if below else found
+        if below or not split[i]:
+            if not below:
+                cut[found] = i
+                found += 1
+                first[i] = found - 1
+            below = True
+        done[i] = True
+        for s in range(2):
+            if child[i, s] >= 0:
+                top += 1
+                stack[top] = child[i, s]
+                inside[top] = below
+    return first, last, cut[:found].copy()
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _inherit(bits: Any, normals: Any, toward: Any, known: Any, around: Any, least: Any) -> None:
+    """Bits that all rows around agree on, 2 below the horizon, 3 where a ray is needed."""
+    for p in numba.prange(len(bits)):
+        have = 0
+        for k in range(4):
+            if around[p, k] >= 0:
+                have += 1
+        for d in range(bits.shape[1]):
+            cos = (
+                normals[p, 0] * toward[d, 0]
+                + normals[p, 1] * toward[d, 1]
+                + normals[p, 2] * toward[d, 2]
+            )
+            if cos < -0.06:
+                bits[p, d] = 2
+                continue
+            value = 3
+            if have >= least:
+                for k in range(4):
+                    if around[p, k] >= 0:
+                        b = known[around[p, k], d]
+                        if b == 2 or (value != 3 and b != value):
+                            value = 3
+                            break
+                        value = b
+            bits[p, d] = value
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _count(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: Any) -> None:
+    """Running counts of nodes that are hidden, not surely visible, not surely hidden."""
+    for p in numba.prange(len(bits)):
+        a, b, c = 0, 0, 0
+        for d in range(bits.shape[1]):
+            hidden[p, d], unseen[p, d], unhidden[p, d] = a, b, c
+            own = bits[p, d]
+            some_seen, some_hidden = own != 0, own != 1
+            if own == 2:
+                some_hidden = True
+            for k in range(neighbours.shape[1]):
+                other = bits[p, neighbours[d, k]]
+                if other == 1:
+                    some_seen = True
+                elif other == 0:
+                    some_hidden = True
+            a += own == 0
+            b += some_hidden
+            c += some_seen
+        d = bits.shape[1]
+        hidden[p, d], unseen[p, d], unhidden[p, d] = a, b, c
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, share: Any) -> None:
+    """How unevenly the corners of a cell are lit: root of the summed squares of the shares of
+    irradiance that some see and others do not. Many small ones vary evenly; a large one jumps."""
+    for p in numba.prange(len(cells)):
+        total, unlike = 1e-30, 0.0
+        for d in range(bits.shape[1]):
+            cos = (
+                normals[p, 0] * toward[d, 0]
+                + normals[p, 1] * toward[d, 1]
+                + normals[p, 2] * toward[d, 2]
+            )
+            if cos <= 0.0:
+                continue
+            seen = 0
+            blocked = 0
+            for k in range(4):
+                if cells[p, k] >= 0:
+                    b = bits[cells[p, k], d]
+                    seen += b == 1
+                    blocked += b == 0
+            if seen > 0:
+                total += share[d] * cos
+                if blocked > 0:
+                    unlike += (share[d] * cos) ** 2
+        out[p] = math.sqrt(unlike) / total
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _interpolate(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
+    for p in numba.prange(len(out)):
+        for c in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                out[p, c, j] = weights[p, 0] * coarse[corners[p, 0], c, j]
+            for k in range(1, 4):
+                if weights[p, k] != 0.0:
+                    w, q = weights[p, k], corners[p, k]
+                    for j in range(out.shape[2]):
+                        out[p, c, j] += w * coarse[q, c, j]
+
+
+@numba.njit(cache=True, inline="always")
+def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> Any:
+    """Put the quarters of a piece of a texel on the stack `cells`; returns its new top."""
+    tm, fm = f32(0.5) * (t0 + t1), f32(0.5) * (f0 + f1)
+    for a in range(4):
+        top += 1
+        cells[top, 0] = t0 if a < 2 else tm
+        cells[top, 1] = tm if a < 2 else t1
+        cells[top, 2] = f0 if a % 2 == 0 else fm
+        cells[top, 3] = fm if a % 2 == 0 else f1
+    return top
+
+
+@numba.njit(cache=True, inline="always")
+def _turned(angle: Any, sine: Any, cosine: Any) -> Any:
+    """Sine and cosine after turning by a small angle (at most 0.4)."""
+    x = angle * angle
+    s = angle * (f32(1.0) - x * (f32(1 / 6) - x * (f32(1 / 120) - x * f32(1 / 5040))))
+    c = f32(1.0) - x * (f32(0.5) - x * (f32(1 / 24) - x * (f32(1 / 720) - x * f32(1 / 40320))))
+    return sine * c + cosine * s, cosine * c - sine * s
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) -> Any:
+    """Irradiance (summed over colours) to some percent: what bright nodes are measured against."""
+    total = f32(0.0)
+    top = 0
+    stack[0] = 0
+    while top >= 0:
+        i = stack[top]
+        top -= 1
+        cos_i = n[0] * place[i, 0] + n[1] * place[i, 1] + n[2] * place[i, 2]
+        if place[i, 3] > f32(0.2) and (child[i, 0] >= 0 or child[i, 1] >= 0):
+            for s in range(2):
+                if child[i, s] >= 0:
+                    top += 1
+                    stack[top] = child[i, s]
+        elif cos_i > f32(0.0):
+            for c in range(3):
+                e = n[0] * moment[i, 3 * c] + n[1] * moment[i, 3 * c + 1]
+                total += max(f32(0.0), e + n[2] * moment[i, 3 * c + 2])
+    return max(total, f32(1e-30))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _walk(
+    leaves: Any, ask: Any, answers: Any, n: Any, v: Any, mask: Any,
+    place: Any, moment: Any, child: Any, box: Any, image: Any,
+    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
+    spread: Any, rule: Any, low: Any, high: Any, outline: Any,
+    stack: Any, fates: Any, cells: Any,
+) -> Any:  # fmt: skip
+    """Leaves of one group into `leaves` (13, n): direction, vector irradiance RGB, variance.
+
+    Where a ray of its own decides on a leaf, or on all pieces of a texel, the direction is put
+    into `ask` and the light let through if `answers` says so (1).
+
+    A node is a leaf where its reach in half-vector space is at most `relative` times its distance
+    from the mirror peak, it carries at most the share `brightest` of the irradiance or is
+    accordingly smaller, it is no wider than `widest`, and, if the horizon cuts it, `horizon`.
+    `low` and `high` bound sin(theta_h). All holds for half vectors up to `spread` away from those
+    of `n` and `v`. Returns the number of leaves, the capacity if too many, and of questions.
+    """
+    relative, brightest, horizon, widest = rule[0], rule[1], rule[2], rule[3]
+    t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
+    row_sin = row_cos = column_sin = column_cos = f32(0.0)
+    total = _coarse_irradiance(n, place, moment, child, stack)
+    n0, n1, n2 = n[0], n[1], n[2]
+    v0, v1, v2 = v[0], v[1], v[2]
+    rows = 0
+    while rows < 4 and mask[rows] >= 0:
+        rows += 1
+    count = 0
+    asked = 0
+    top = 0
+    stack[0] = 0
+    fates[0] = _UNKNOWN if rows > 0 else _LIT
+    fate = _LIT
+    seen = f32(1.0)
+    piece = -1
+    texel = 0
+    while top >= 0 or piece >= 0:
+        in_texel = piece >= 0
+        t0 = t1 = f0 = f1 = st = m0 = m1 = m2 = f32(0.0)
+        if in_texel:
+            i = texel
+            t0, t1, f0, f1 = cells[piece, 0], cells[piece, 1], cells[piece, 2], cells[piece, 3]
+            piece -= 1
+            st, ct = _turned(f32(0.5) * (t0 + t1), row_sin, row_cos)
+            sf, cf = _turned(f32(0.5) * (f0 + f1), column_sin, column_cos)
+            cx, cy, cz = -st * sf, ct, st * cf
+            dt, df = t1 - t0, st * (f1 - f0)
+            r = f32(0.5) * f32(math.sqrt(dt * dt + df * df))
+            variance = r * r / f32(6.0)
+        else:
+            i = np.int64(stack[top])
+            top -= 1
+            cx, cy, cz = place[i, 0], place[i, 1], place[i, 2]
+            r, variance = place[i, 3], place[i, 4]
+        cos_i = n0 * cx + n1 * cy + n2 * cz
+        # the centroid may lie in a corner: everything is within 2 r of it
+        if cos_i < f32(-2.0) * r - spread:
+            continue
+        hx, hy, hz = cx + v0, cy + v1, cz + v2
+        length = f32(math.sqrt(hx * hx + hy * hy + hz * hz))
+        px, py, pz = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
+        sin_h = f32(math.sqrt(px * px + py * py + pz * pz)) / max(length, f32(1e-6))
+        reach = r / max(length, f32(0.15))
+        nearest = sin_h - f32(2.0) * reach - spread
+        if nearest > high or sin_h + f32(2.0) * reach + spread < low:
+            continue
+        if not in_texel:
+            # shadows: what is known of a node holds for all below it
+            fate = fates[top + 1]
+            if fate == _UNKNOWN:
+                d0, d1 = first[i], last[i]
+                if nearest > outline:
+                    blocked = 0
+                    for k in range(rows):
+                        blocked += hidden[mask[k], d1] - hidden[mask[k], d0]
+                    if blocked == rows * (d1 - d0):
+                        continue
+                    if blocked == 0:
+                        fate = _LIT
+                    elif d1 - d0 == 1:
+                        seen = f32(1.0) - f32(blocked) / f32(rows)
+                        fate = _PARTLY
+                else:
+                    not_seen, not_hidden = 0, 0
+                    for k in range(rows):
+                        q = mask[k]
+                        not_seen += unseen[q, d1] - unseen[q, d0]
+                        not_hidden += unhidden[q, d1] - unhidden[q, d0]
+                    if not_hidden == 0:
+                        continue
+                    if not_seen == 0:
+                        fate = _LIT
+                    elif d1 - d0 == 1:
+                        fate = _DOUBTFUL
+            elif fate == _PARTLY:
+                blocked = 0
+                for k in range(rows):
+                    blocked += hidden[mask[k], last[i]] - hidden[mask[k], first[i]]
+                seen = f32(1.0) - f32(blocked) / f32(rows)
+            else:
+                seen = f32(1.0)
+            if fate in (_LIT, _DOUBTFUL):
+                seen = f32(1.0)
+        if in_texel:
+            half, _ = _turned(f32(0.5) * (t1 - t0), f32(0.0), f32(1.0))
+            omega = f32(2.0) * st * half * (f1 - f0)
+            row, column = box[i, 0], box[i, 2]
+            m0 = image[row, column, 0] * omega
+            m1 = image[row, column, 1] * omega
+            m2 = image[row, column, 2] * omega
+            flux = (m0 + m1 + m2) * cos_i
+        else:
+            flux = (
+                n0 * (moment[i, 0] + moment[i, 3] + moment[i, 6])
+                + n1 * (moment[i, 1] + moment[i, 4] + moment[i, 7])
+                + n2 * (moment[i, 2] + moment[i, 5] + moment[i, 8])
+            )
+        allowed = relative * (max(sin_h - reach - spread, f32(0.0)) + f32(3e-3))
+        share = flux / total
+        if share > brightest:
+            allowed *= max(f32(0.25), f32(math.sqrt(brightest / share)))
+        if (
+            reach > allowed
+            or r > widest
+            or (not in_texel and fate == _UNKNOWN)
+            or (abs(cos_i) < f32(2.0) * r + spread and r > horizon)
+        ):
+            if in_texel:
+                if piece + 4 < len(cells) and r > f32(1e-5):
+                    piece = _push_quarters(cells, piece, t0, t1, f0, f1)
+                    continue
+            elif child[i, 0] == -2:
+                if fate == _DOUBTFUL and asked < len(ask):
+                    # one ray for the whole texel
+                    ask[asked, 0], ask[asked, 1], ask[asked, 2] = cx, cy, cz
+                    seen = f32(answers[asked])
+                    asked += 1
+                    fate = _LIT
+                texel = i
+                t, f = (box[i, 0] + 0.5) * t_step, (box[i, 2] + 0.5) * f_step
+                row_sin, row_cos = f32(math.sin(t)), f32(math.cos(t))
+                column_sin, column_cos = f32(math.sin(f)), f32(math.cos(f))
+                t, f = f32(0.5 * t_step), f32(0.5 * f_step)
+                piece = _push_quarters(cells, piece, -t, t, -f, f)
+                continue
+            else:
+                for s in range(2):
+                    if child[i, s] >= 0:
+                        top += 1
+                        stack[top] = child[i, s]
+                        fates[top] = fate
+                continue
+        if cos_i <= -spread:
+            continue
+        if fate == _DOUBTFUL and asked < len(ask):
+            ask[asked, 0], ask[asked, 1], ask[asked, 2] = cx, cy, cz
+            seen = f32(answers[asked])
+            asked += 1
+        if seen == f32(0.0):
+            continue
+        if count == leaves.shape[1]:
+            return count, asked
+        leaves[0, count], leaves[1, count], leaves[2, count] = cx, cy, cz
+        if in_texel:
+            m0, m1, m2 = m0 * seen, m1 * seen, m2 * seen
+            leaves[3, count], leaves[4, count], leaves[5, count] = m0 * cx, m0 * cy, m0 * cz
+            leaves[6, count], leaves[7, count], leaves[8, count] = m1 * cx, m1 * cy, m1 * cz
+            leaves[9, count], leaves[10, count], leaves[11, count] = m2 * cx, m2 * cy, m2 * cz
+        else:
+            for k in range(9):
+                leaves[3 + k, count] = seen * moment[i, k]
+        leaves[12, count] = variance
+        count += 1
+    return count, asked
+
+
+@numba.njit(cache=True, inline="always")
+def _arctan(y: Any, x: Any) -> Any:
+    """atan2 in the first quadrant, to 2e-6 of the angle (Abramowitz & Stegun 4.4.49)."""
+    t = min(x, y) / max(max(x, y), f32(1e-30))
+    s = t * t
+    a = f32(-0.0040540580)
+    a = a * s + f32(0.0218612288)
+    a = a * s + f32(-0.0559098861)
+    a = a * s + f32(0.0964200441)
+    a = a * s + f32(-0.1390853351)
+    a = a * s + f32(0.1994653599)
+    a = a * s + f32(-0.3332985605)
+    a = a * s + f32(0.9999993329)
+    a *= t
+    return a if y <= x else f32(0.5 * math.pi) - a
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _stencils(
+    n: Any, v: Any, leaves: Any, count: Any,
+    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
+) -> None:  # fmt: skip
+    """First cells and interpolation weights of leaves: free of branches, so that it vectorises.
+
+    cell (2, n): the lowest cell of the nearer theta_h sample, and how many theta_h nodes further
+    the other one starts; place (7, n): fractions along theta_h (both samples), theta_d, phi_d, and
+    the irradiance RGB.
+    """
+    n0, n1, n2 = n[0], n[1], n[2]
+    v0, v1, v2 = v[0], v[1], v[2]
+    half_pi = f32(0.5 * math.pi)
+    k = f32(n_h - 1)
+    for q in range(count):
+        cx, cy, cz = leaves[0, q], leaves[1, q], leaves[2, q]
+        hx, hy, hz = cx + v0, cy + v1, cz + v2
+        squared = hx * hx + hy * hy + hz * hz
+        length = f32(math.sqrt(squared))
+        scale = f32(1.0) / max(length, f32(1e-6))
+        px, py, pz = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
+        px, py, pz = px * scale, py * scale, pz * scale
+        sin_h = f32(math.sqrt(px * px + py * py + pz * pz))
+        cos_h = (hx * n0 + hy * n1 + hz * n2) * scale
+        cos_i = n0 * cx + n1 * cy + n2 * cz
+        dx, dy, dz = cx - v0, cy - v1, cz - v2
+        theta_d = _arctan(f32(math.sqrt(dx * dx + dy * dy + dz * dz)), length)
+        theta_h = _arctan(sin_h, max(cos_h, f32(0.0)))
+        across = abs(cx * px + cy * py + cz * pz)
+        along = abs(f32(0.5) * length * cos_h - cos_i)
+        phi_d = _arctan(across, along)
+        y = theta_d * (f32(n_d - 1) / half_pi)
+        b0 = min(np.int32(y), np.int32(n_d - 2))
+        z = phi_d * (f32(n_p - 1) / half_pi)
+        c0 = min(np.int32(z), np.int32(n_p - 2))
+        # in the plane of incidence h moves half as far as wi, across it 1 / (2 cos theta_d) as far
+        stretch = f32(4.0) / max(squared, f32(0.01))
+        ss = across * across / max(across * across + along * along, f32(1e-30))
+        outward = f32(0.25) * leaves[12, q] * ((f32(1.0) - ss) + ss * stretch)
+        sideways = f32(0.25) * leaves[12, q] * (ss + (f32(1.0) - ss) * stretch)
+        middle = f32(math.sqrt(theta_h * theta_h + sideways))
+        delta = f32(math.sqrt(outward))
+        near = min(abs(middle - delta), half_pi)
+        a0 = min(np.int32(f32(math.sqrt(near / half_pi)) * k), np.int32(n_h - 2))
+        start = f32(a0) * f32(a0)
+        fa = (near / half_pi * k * k - start) / (f32(2.0) * f32(a0) + f32(1.0))
+        far = min(middle + delta, half_pi)
+        a1 = min(np.int32(f32(math.sqrt(far / half_pi)) * k), np.int32(n_h - 2))
+        start = f32(a1) * f32(a1)
+        fb = (far / half_pi * k * k - start) / (f32(2.0) * f32(a1) + f32(1.0))
+        cell[0, q] = (a0 * n_d + b0) * n_p + c0
+        cell[1, q] = a1 - a0
+        place[0, q] = min(max(fa, f32(0.0)), f32(1.0))
+        place[1, q] = min(max(fb, f32(0.0)), f32(1.0))
+        place[2, q] = min(y - f32(b0), f32(1.0))
+        place[3, q] = min(z - f32(c0), f32(1.0))
+        up = f32(1.0) if cos_i > f32(0.0) else f32(0.0)
+        e0 = n0 * leaves[3, q] + n1 * leaves[4, q] + n2 * leaves[5, q]
+        e1 = n0 * leaves[6, q] + n1 * leaves[7, q] + n2 * leaves[8, q]
+        e2 = n0 * leaves[9, q] + n1 * leaves[10, q] + n2 * leaves[11, q]
+        place[4, q] = max(e0, f32(0.0)) * up
+        place[5, q] = max(e1, f32(0.0)) * up
+        place[6, q] = max(e2, f32(0.0)) * up
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _add_cells(
+    out: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
+    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
+) -> None:  # fmt: skip
+    """Add one sample's leaves to its row `out` (3, cells)."""
+    _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
+    half = f32(0.5) * share
+    for q in range(count):
+        fb, fc = place[2, q], place[3, q]
+        e0, e1, e2 = half * place[4, q], half * place[5, q], half * place[6, q]
+        for side in range(2):
+            fa = place[side, q]
+            base = cell[0, q] + side * cell[1, q] * n_d * n_p
+            for a in range(2):
+                wa = fa if a else f32(1.0) - fa
+                for b in range(2):
+                    wb = wa * (fb if b else f32(1.0) - fb)
+                    for c in range(2):
+                        w = wb * (fc if c else f32(1.0) - fc)
+                        k = base + (a * n_d + b) * n_p + c
+                        out[0, k] += w * e0
+                        out[1, k] += w * e1
+                        out[2, k] += w * e2
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _add_leaves(
+    out: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
+    n_h: Any, n_d: Any, n_p: Any, tables: Any, cell: Any, place: Any,
+) -> None:  # fmt: skip
+    """Add one sample's leaves to its radiance `out` (3, T) under tables (cells, T)."""
+    step = n_d * n_p
+    _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
+    for q in range(count):
+        e0, e1, e2 = share * place[4, q], share * place[5, q], share * place[6, q]
+        if e0 + e1 + e2 == f32(0.0):
+            continue
+        fb, fc = place[2, q], place[3, q]
+        w0 = f32(0.5) * (f32(1.0) - fb) * (f32(1.0) - fc)
+        w1 = f32(0.5) * (f32(1.0) - fb) * fc
+        w2 = f32(0.5) * fb * (f32(1.0) - fc)
+        w3 = f32(0.5) * fb * fc
+        g0 = place[0, q]
+        g1 = place[1, q]
+        i = cell[0, q]
+        j = i + step
+        if cell[1, q] == 0:
+            # both samples lie between the same theta_h nodes
+            g0 += g1
+            h0 = f32(2.0) - g0
+            for t in range(tables.shape[1]):
+                x = h0 * (
+                    w0 * tables[i, t] + w1 * tables[i + 1, t]
+                    + w2 * tables[i + n_p, t] + w3 * tables[i + n_p + 1, t]
+                ) + g0 * (
+                    w0 * tables[j, t] + w1 * tables[j + 1, t]
+                    + w2 * tables[j + n_p, t] + w3 * tables[j + n_p + 1, t]
+                )  # fmt: skip
+                out[0, t] += e0 * x
+                out[1, t] += e1 * x
+                out[2, t] += e2 * x
+        else:
+            h0, h1 = f32(1.0) - g0, f32(1.0) - g1
+            k = i + cell[1, q] * step
+            m = k + step
+            for t in range(tables.shape[1]):
+                x = h0 * (
+                    w0 * tables[i, t] + w1 * tables[i + 1, t]
+                    + w2 * tables[i + n_p, t] + w3 * tables[i + n_p + 1, t]
+                ) + g0 * (
+                    w0 * tables[j, t] + w1 * tables[j + 1, t]
+                    + w2 * tables[j + n_p, t] + w3 * tables[j + n_p + 1, t]
+                )  # fmt: skip
+                x += h1 * (
+                    w0 * tables[k, t] + w1 * tables[k + 1, t]
+                    + w2 * tables[k + n_p, t] + w3 * tables[k + n_p + 1, t]
+                ) + g1 * (
+                    w0 * tables[m, t] + w1 * tables[m + 1, t]
+                    + w2 * tables[m + n_p, t] + w3 * tables[m + n_p + 1, t]
+                )  # fmt: skip
+                out[0, t] += e0 * x
+                out[1, t] += e1 * x
+                out[2, t] += e2 * x
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+def _one_leaf(
+    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any,
+    n_h: Any, n_d: Any, n_p: Any, tables: Any,
+) -> None:  # fmt: skip
+    """Add one leaf (13, 1) a sample: to radiance, or to rows where `tables` has no column."""
+    for f in numba.prange(len(out)):
+        cell = np.empty((2, 1), np.int32)
+        place = np.empty((7, 1), np.float32)
+        for p in range(starts[f], starts[f + 1]):
+            if tables.shape[1] > 0:
+                _add_leaves(
+                    out[f], normals[p], views[p], share[p], 1, leaves[p],
+                    n_h, n_d, n_p, tables, cell, place,
+                )  # fmt: skip
+            else:
+                _add_cells(
+                    out[f], normals[p], views[p], share[p], 1, leaves[p],
+                    n_h, n_d, n_p, cell, place,
+                )  # fmt: skip
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+def _shade(
+    out: Any, short: Any, ask: Any, asked: Any, answers: Any, final: Any,
+    bundle_start: Any, group_start: Any, target: Any, normals: Any, views: Any, share: Any,
+    middle_normals: Any, middle_views: Any, spread: Any, masks: Any, several: Any,
+    place: Any, moment: Any, child: Any, box: Any, image: Any,
+    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
+    rules: Any, low: Any, high: Any, outline: Any, capacity: Any,
+    n_h: Any, n_d: Any, n_p: Any, tables: Any,
+) -> None:  # fmt: skip
+    """Add the leaves of all groups: to radiance, or to rows where `tables` has no column.
+
+    Unless this is the `final` call, groups with questions are left out; groups with more leaves
+    than the capacity always are (`short`).
+    """
+    block = 8
+    bundles = len(bundle_start) - 1
+    for u in numba.prange((bundles + block - 1) // block):
+        stack = np.empty(512, np.int32)
+        fates = np.empty(512, np.int8)
+        cells = np.empty((256, 4), np.float32)
+        leaves = np.empty((13, capacity), np.float32)
+        cell = np.empty((2, capacity), np.int32)
+        part = np.empty((7, capacity), np.float32)
+        for g in range(bundle_start[u * block], bundle_start[min(u * block + block, bundles)]):
+            count, asked[g] = _walk(
+                leaves, ask[g], answers[g], middle_normals[g], middle_views[g], masks[g],
+                place, moment, child, box, image, first, last, hidden, unseen, unhidden,
+                spread[g], rules[1 if several[g] else 0], low, high, outline,
+                stack, fates, cells,
+            )  # fmt: skip
+            if count == capacity:
+                short[g] = True
+                continue
+            if asked[g] > 0 and not final:
+                continue
+            for p in range(group_start[g], group_start[g + 1]):
+                if tables.shape[1] > 0:
+                    _add_leaves(
+                        out[target[p]], normals[p], views[p], share[p], count, leaves,
+                        n_h, n_d, n_p, tables, cell, part,
+                    )  # fmt: skip
+                else:
+                    _add_cells(
+                        out[target[p]], normals[p], views[p], share[p], count, leaves,
+                        n_h, n_d, n_p, cell, part,
+                    )  # fmt: skip
