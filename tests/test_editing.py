@@ -21,9 +21,10 @@ from hypothesis import strategies as st
 
 import traitbrdf as tb
 from traitbrdf import editing
-from traitbrdf.editing import EditSession, Material
+from traitbrdf.editing import EditSession
 from traitbrdf.formats import FormatError, read_arrays, write_arrays
 from traitbrdf.models import GGX, Lambert, PerfectMirror
+from traitbrdf.shapes import Mesh
 from traitbrdf.strokes import Stroke, follow
 from traitbrdf.traits import default_traits
 from traitbrdf.transport import Training, Transport
@@ -47,7 +48,7 @@ def prepared(small_teapot, training):
 
 @pytest.fixture(scope="module")
 def prepared_ball(training):
-    """A ball on the ground, in few pixels: the transport that sessions over its scene start with."""
+    """A ball on the ground, in few pixels, prepared."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(editing, "_training", lambda library, seed: training)
         return EditSession(ball_scene(), quality="preview").prepare()
@@ -117,7 +118,7 @@ def test_the_ground_starts_plain(prepared_ball):
     assert session.material("ground").name == "concrete"
     assert session.material("sphere").name == "white-plastic"
     albedo = session.brdf("ground").albedo(np.radians([30.0]))[0]
-    assert 0.1 < albedo.min() and albedo.max() < 0.5 and np.ptp(albedo) < 0.1 * albedo.max()
+    assert 0.9 * albedo.max() < albedo.min() < albedo.max() < 0.5
     session.assign("ground", "blue-plastic")
     assert session.undo()
     assert session.material("ground").name == "concrete"
@@ -614,3 +615,1100 @@ def test_the_report_is_plain_finite_json(edit):
         assert 0.0 <= entry["gamut_margin"] <= 0.5
     edit.assign("body", "red-rubber")  # no frame in between
     assert edit.report()["parts"]["body"]["material"] == "red-rubber"
+
+
+def test_the_report_says_what_was_left_out(prepared_ball):
+    session = over(prepared_ball, error=1.0)
+    session.render()
+    session.assign("sphere", "blue-plastic")
+    session.render()
+    left = session.report()["left_out"]
+    scene, transport = session.scene, session.prepare()
+    assert left["shadow_rays"]["parts"] == ["sphere"]  # convex: the ground alone needs rays
+    assert left["cells"]["seen"] == len(transport.cells) < left["cells"]["of"]
+    assert left["channels"] == {"computed": 3, "of": 3}
+    assert left["parts_not_edited"]["parts"] == ["ground"]
+    assert left["parts_not_edited"]["seconds_saved"] > 0.0
+    assert left["pixels"]["redrawn"] == inside(scene, "sphere").sum()
+    assert left["pixels"]["of"] == scene.height * scene.width
+    times = [
+        left[what][key] for what in ("cells", "pixels") for key in ("seconds", "seconds_for_all")
+    ]
+    assert min(times) > 0.0
+    session.look(environment=tb.EnvironmentMap.uniform(rows=4))
+    assert session.report()["left_out"]["channels"]["computed"] == 1
+
+
+# -- ground, shadows, older files -------------------------------------------------------------
+
+
+def test_a_design_keeps_ground_shadows_and_texture_coordinates(tmp_path, training):
+    pot = tb.teapot()
+    mesh = Mesh(pot.vertices, pot.faces, pot.normals, pot.face_part, pot.parts, pot.vertices[:, :2])
+    sky = tb.EnvironmentMap.sky(rows=16)
+    scene = tb.Scene(mesh, sky, size=16, ground=1.5, shadows=False, subsamples=3)
+    session = EditSession(scene, "preview")
+    session.assign("ground", "grey-felt" if "grey-felt" in LIBRARY else "chalk")
+    session.save(tmp_path / "pot.tbr")
+    again = EditSession.load(tmp_path / "pot.tbr")
+    assert (again.scene.ground, again.scene.shadows, again.scene.subsamples) == (1.5, False, 3)
+    assert again.scene.parts == scene.parts
+    assert again.material("ground").name == session.material("ground").name
+    same(again.scene.shape.uvs, mesh.uvs)
+    same(again.scene.weights, scene.weights)
+    # so that what was prepared for it is found again
+    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0) for s in (session, again)]
+    assert keys[0] == keys[1]
+
+
+def test_designs_from_before_there_were_shadows_still_load(saved, tmp_path):
+    arrays = read_arrays(saved)
+    header = json.loads(str(arrays["design"]))
+    for name in ("ground", "shadows", "subsamples", "anywhere"):
+        del header[name]
+    arrays["design"] = np.array(json.dumps({**header, "format": 1}))
+    write_arrays(tmp_path / "old.tbr", arrays)
+    again = EditSession.load(tmp_path / "old.tbr")
+    assert (again.scene.ground, again.scene.shadows, again.scene.subsamples) == (False, False, 1)
+    assert again.history == EditSession.load(saved).history
+    again.save(tmp_path / "new.tbr")
+    assert EditSession.load(tmp_path / "new.tbr").scene.subsamples == 1
+
+
+# -- looking ----------------------------------------------------------------------------------
+
+
+def test_looking_elsewhere_keeps_the_design(edit):
+    edit.assign("body", "blue-plastic")
+    edit.move("lid", shiny=0.2)
+    edit.undo()
+    edit.render()
+    scene, history = edit.scene, edit.history
+    edit.look(camera=tb.Camera.orbit(80.0, 30.0), size=(20, 30))
+    assert (edit.scene.height, edit.scene.width) == (20, 30)
+    assert edit.scene.camera == tb.Camera.orbit(80.0, 30.0)
+    assert edit.scene.environment is scene.environment
+    assert edit.scene.lights == scene.lights
+    assert not edit.ready
+    assert edit.history == history
+    assert edit.material("body").name == "blue-plastic"
+    assert edit.render().shape == (20, 30, 3)
+    assert edit.redo()
+    assert edit.history[-1] == "edit.move('lid', shiny=0.2)"
+
+
+def test_looking_under_another_light(edit):
+    scene = edit.scene
+    edit.look(rotation=1.25)
+    assert edit.scene.environment.rotation == 1.25
+    assert edit.scene.environment.image is scene.environment.image
+    same(edit.scene.normals, scene.normals)
+    light = tb.PointLight((0.0, 5.0, 0.0))
+    edit.look(environment=tb.EnvironmentMap.uniform(rows=4), lights=[light])
+    assert edit.scene.lights == (light,)
+    assert edit.scene.environment.rotation == 0.0
+    edit.look(lights=())
+    assert edit.scene.lights == ()
+
+
+def test_looking_at_the_same_again_keeps_what_is_prepared(edit):
+    scene = edit.scene
+    edit.look()
+    edit.look(
+        camera=tb.Camera(**vars(scene.camera)), environment=scene.environment,
+        lights=list(scene.lights), size=(48, 60), rotation=scene.environment.rotation,
+    )  # fmt: skip
+    assert edit.scene is scene
+    assert edit.ready
+
+
+@pytest.mark.parametrize(
+    ("wanted", "error"),
+    [
+        ({"camera": "left"}, TypeError),
+        ({"environment": "sky.exr"}, TypeError),
+        ({"environment": "sky.exr", "rotation": 1.0}, TypeError),
+        ({"lights": ["a lamp"]}, TypeError),
+        ({"size": 0}, ValueError),
+        ({"size": (4, 0)}, ValueError),
+        ({"rotation": math.nan}, ValueError),
+        ({"rotation": 1.0, "size": -1}, ValueError),
+    ],
+)
+def test_a_look_that_cannot_be_taken_changes_nothing(edit, wanted, error):
+    scene = edit.scene
+    with pytest.raises(error, match=r"expected"):
+        edit.look(**wanted)
+    assert edit.scene is scene
+    assert edit.ready
+
+
+def test_strokes_replay_after_the_picture_was_framed_anew(prepared_ball, tmp_path):
+    """A stroke lies on the image of its view: elsewhere the history names the parts."""
+    session = over(prepared_ball)
+    stroke = Stroke([(2.0, 10.0), (18.0, 18.0)], "shiny", 0.4, 4.0)
+    moved = session.paint(stroke)
+    assert len(moved) == 2
+    assert session.history[0].startswith("edit.paint(")
+    session.look(rotation=1.0)  # the light moves nothing on the image
+    assert session.history[0].startswith("edit.paint(")
+    session.look(camera=tb.Camera.orbit(-60.0, 50.0), size=24)
+    session.paint(Stroke([(2.0, 10.0), (18.0, 18.0)], "bright", 0.3, 4.0, hold=("colour", "shiny")))
+    first, second = session.history
+    assert first.count("edit.move(") == 2
+    assert second.startswith("edit.paint(")
+    session.save(tmp_path / "ball.tbr")
+    loaded = EditSession.load(tmp_path / "ball.tbr")
+    assert loaded.history == session.history
+    for one in (session, loaded):
+        again = EditSession(one.scene, "preview")
+        for line in one.history:
+            exec(line, {"tb": tb, "edit": again})
+        for part in one.scene.parts:
+            same(again.material(part).z, session.material(part).z)
+    for one in (session, loaded):  # and framed once more
+        one.look(camera=tb.Camera.orbit(0.0, 10.0))
+        assert all("edit.paint" not in line for line in one.history)
+        again = EditSession(one.scene, "preview")
+        for line in one.history:
+            exec(line, {"tb": tb, "edit": again})
+        for part in one.scene.parts:
+            same(again.material(part).z, session.material(part).z)
+    assert loaded.history == session.history
+
+
+# -- several parts at once --------------------------------------------------------------------
+
+
+def test_parts_of_one_material_stay_so(edit):
+    edit.assign(["lid", "rim"], "gold-satin")
+    edit.move(["lid", "rim", "spout"], shiny=0.2, hold="colour")
+    assert edit.material("lid") is edit.material("rim")
+    assert edit.material("lid") is not edit.material("spout")
+    assert edit.history[-1] == "edit.move(['lid', 'rim', 'spout'], shiny=0.2, hold=('colour',))"
+    assert edit.undo()
+    assert edit.material("rim").name == "gold-satin"
+    before = dict(edit._materials)
+    for wrong in (["lid", "rimm"], []):
+        with pytest.raises(ValueError, match="part"):
+            edit.move(wrong, shiny=0.2)
+    assert edit._materials == before
+
+
+def test_equal_materials_are_decoded_once(edit, monkeypatch):
+    calls = []
+    plain = EMBEDDING.decode_values
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return plain(*arguments)
+
+    edit.assign(edit.scene.parts, LIBRARY.coordinates[5])
+    monkeypatch.setattr(EMBEDDING, "decode_values", counted)
+    edit.render()
+    assert len(calls) == 1
+    edit.move("handle", bright=0.1)
+    edit.render()
+    edit.render()
+    assert len(calls) == 2  # parts that were not edited are not decoded
+
+
+# -- what is drawn again ----------------------------------------------------------------------
+
+
+def test_pixels_that_are_drawn_again_are_those_of_the_whole_picture(edit):
+    """Borders of parts, and with the backdrop, are sums: bit by bit those of a full composition."""
+    rng = np.random.default_rng(4)
+    transport = edit.prepare()
+    seen = {}
+    for _ in range(25):
+        kind = rng.integers(5)
+        if kind == 0:
+            edit.undo()
+        elif kind == 1:
+            edit.redo()
+        else:
+            parts = rng.choice(edit.scene.parts, rng.integers(1, 4), replace=False).tolist()
+            edit.assign(parts, LIBRARY.coordinates[rng.integers(len(LIBRARY))])
+        image = edit.render()
+        whole = transport.compose([one.frame for one in edit._view.shown])
+        same(image, whole.numpy())
+        design = tuple(edit._materials.values())
+        same(image, seen.setdefault(design, image))
+    assert len(seen) < 25
+
+
+def test_the_caller_may_write_into_a_frame(edit):
+    image = edit.render()
+    whole = image.copy()
+    image[:] = -1.0
+    same(edit.render(), whole)
+    edit.assign("lid", "chrome")
+    edit.render()[:] = 7.0
+    edit.undo()
+    same(edit.render(), whole)
+
+
+def test_a_frame_that_was_cut_off_is_drawn_again(edit, monkeypatch):
+    whole = edit.render()
+    edit.assign("body", "chrome")
+
+    def interrupted(changed, frames):
+        edit._view.canvas._image[: 48 * 30] = 3.0
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(edit._view.canvas, "redraw", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            edit.render()
+    edit.undo()
+    same(edit.render(), whole)
+
+
+def test_kept_frames_are_bounded(edit, monkeypatch):
+    monkeypatch.setattr(editing, "FRAMES_KEPT", 60_000)
+    first = edit.render()
+    for i in range(20):
+        edit.assign("body", LIBRARY.coordinates[i])
+        edit.render()
+    view = edit._view
+    assert view.kept_bytes == sum(editing._size(one) for one in view.kept.values()) <= 60_000
+    for _ in range(20):
+        edit.undo()
+    same(edit.render(), first)  # computed anew
+
+
+# -- drafts -----------------------------------------------------------------------------------
+
+
+def test_a_draft_shows_the_frame_at_once(prepared_ball):
+    session = EditSession(prepared_ball.scene, "preview")
+    session.assign("sphere", PerfectMirror((0.4, 0.5, 0.6)) + 0.5 * Lambert(0.5))
+    image, error = session.draft()
+    assert not session.ready
+    assert image.shape == (20, 20, 3)
+    assert image.dtype == np.float32
+    assert 0.0 <= error < 0.1
+    after = over(prepared_ball)
+    after.assign("sphere", PerfectMirror((0.4, 0.5, 0.6)) + 0.5 * Lambert(0.5))
+    frame = after.render()
+    assert np.abs(image - frame).mean() < 0.05 * frame.mean()
+    draft = session._view.draft
+    image[:] = 0.0  # the caller's
+    assert session.draft()[0].max() > 0.0
+    session.assign("sphere", "red-rubber")
+    second, _ = session.draft()
+    assert session._view.draft is draft
+    assert np.abs(second - frame).mean() > 0.05 * frame.mean()
+
+
+def test_a_draft_is_enlarged_to_the_size_of_the_scene(monkeypatch, prepared_ball):
+    monkeypatch.setattr(editing, "DRAFT_SIZE", 24)
+    session = EditSession(ball_scene(size=(33, 48), ground=False), "preview")
+    image, _ = session.draft()
+    assert image.shape == (33, 48, 3)
+    assert max(session._view.draft.scene.height, session._view.draft.scene.width) == 24
+    assert image.flags.c_contiguous
+    ramp = np.broadcast_to(np.arange(8, dtype=np.float32)[None, :, None], (4, 8, 3)).copy()
+    larger = editing._enlarged(ramp, 8, 16)
+    np.testing.assert_allclose(larger[3, 1:-1, 0], np.arange(0.25, 7.0, 0.5))
+
+
+def test_the_light_is_sorted_once(small_sphere, monkeypatch):
+    built = []
+    plain = editing.LightTree.build
+    monkeypatch.setattr(
+        editing.LightTree, "build", lambda light: built.append(light) or plain(light)
+    )
+    trees = editing._LightTrees()
+    light = small_sphere.environment
+    assert trees.of(light) is trees.of(light.rotated(1.0))
+    assert len(built) == 1
+    trees.of(light.scaled(2.0))
+    assert len(built) == 2
+
+
+# -- preparing behind -------------------------------------------------------------------------
+
+
+class Gate:
+    """A progress callback that holds the preparation until it is opened, or fails then."""
+
+    def __init__(self, failure=None):
+        self.reached, self.opened = threading.Event(), threading.Event()
+        self.failure = failure
+        self.threads = set()
+
+    def __call__(self, stage, fraction):
+        self.threads.add(threading.current_thread())
+        self.reached.set()
+        assert self.opened.wait(60.0)
+        if self.failure is not None:
+            raise self.failure
+
+
+class FailureError(Exception):
+    pass
+
+
+@pytest.fixture
+def gate():
+    gate = Gate()
+    yield gate
+    gate.opened.set()
+
+
+def ended(job):
+    assert job.done.wait(60.0)
+    return job
+
+
+def test_preparing_tells_and_can_be_cancelled():
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=12)
+    told = []
+    session = EditSession(scene, "preview", progress=lambda *news: told.append(news))
+    assert not told  # nothing is prepared before it is needed
+    assert not session.ready
+    transport = session.prepare()
+    assert session.ready
+    assert told[-1][1] == 1.0
+    assert session.prepare() is transport
+
+    def cancel(stage, fraction):
+        raise FailureError
+
+    session = EditSession(scene, "preview", progress=cancel)
+    with pytest.raises(FailureError):
+        session.render()
+    assert not session.ready
+    session._progress = None
+    same(session.render(), session.render())
+
+
+def test_a_preparation_behind_leaves_the_session_usable(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    assert session.prepare(wait=False) is None
+    assert gate.reached.wait(60.0)
+    assert session.prepare(wait=False) is None  # one is enough
+    assert not session.ready
+    session.assign("sphere", "blue-plastic")
+    session.move("sphere", shiny=0.2)
+    session.undo()
+    first = session.render(wait=False)  # the draft
+    assert first.shape == (20, 20, 3)
+    same(first, session.draft()[0])
+    assert not session.ready
+    assert len(session.history) == 1
+    gate.opened.set()
+    frame = session.render()
+    assert session.ready
+    assert len(gate.threads) == 1
+    assert threading.current_thread() not in gate.threads
+    same(session.render(wait=False), frame)
+    assert session._view.job is None
+    assert session.report()["prepared_from"] == "scratch"
+    assert np.abs(first - frame).mean() < 0.05 * frame.mean()
+
+
+def test_a_cancelled_preparation_stops_soon(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    session.cancel()  # nothing runs
+    session.prepare(wait=False)
+    job = session._view.job
+    assert gate.reached.wait(60.0)
+    session.cancel()
+    gate.opened.set()
+    ended(job)
+    assert job.error is None
+    assert job.stopped
+    assert not session.ready
+    assert session.render().shape == (20, 20, 3)  # begins anew
+    session.cancel()
+    assert session.ready
+
+
+def test_who_waits_for_a_cancelled_preparation_is_told(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    caught = []
+
+    def wait():
+        try:
+            session.render()
+        except CancelledError as error:
+            caught.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    assert gate.reached.wait(60.0)
+    session.cancel()
+    gate.opened.set()
+    waiting.join(60.0)
+    assert len(caught) == 1
+    assert "cancelled" in str(caught[0])
+
+
+@pytest.mark.parametrize("call", ["prepare", "render", "look on", "behind"])
+def test_what_fails_behind_is_raised_once(call):
+    gate = Gate(FailureError("no light"))
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    session.prepare(wait=False)
+    job = session._view.job
+    gate.opened.set()
+    ended(job)
+    assert isinstance(job.error, FailureError)
+    assert not session.ready
+    session.draft()  # does not need it
+    gate.failure = None
+    if call == "look on":  # what has failed for another view is of no interest any more
+        session.look(rotation=1.0)
+    else:
+        with pytest.raises(FailureError, match="no light"):
+            if call == "behind":
+                session.render(wait=False)
+            else:
+                getattr(session, call)()
+    assert session.render().shape == (20, 20, 3)
+
+
+def test_looking_elsewhere_stops_the_old_preparation(gate):
+    session = EditSession(ball_scene(ground=False), "preview", progress=gate)
+    old = session.draft()[0]
+    session.render(wait=False)
+    job = session._view.job
+    assert gate.reached.wait(60.0)
+    session.look(camera=tb.Camera.orbit(150.0, 5.0))
+    gate.opened.set()
+    ended(job)
+    assert job.stopped
+    assert not session.ready
+    assert not np.array_equal(session.draft()[0], old)
+    frame = session.render()
+    plain = EditSession(session.scene, "preview").render()
+    same(frame, plain)
+
+
+def test_a_preparation_that_ends_after_the_look_is_not_shown(gate):
+    """Even if the old one can no longer be stopped."""
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    session.prepare(wait=False)
+    job = session._view.job
+    assert gate.reached.wait(60.0)
+    old = session._view
+    job.stop = lambda: None  # comes too late
+    session.look(rotation=2.0)
+    gate.opened.set()
+    ended(job)
+    assert old.transport is not None
+    assert not session.ready
+    assert session.prepare().scene is session.scene
+
+
+def test_looking_about_from_another_thread_never_shows_the_old_view():
+    session = EditSession(ball_scene(12, ground=False), "preview")
+    sizes = [(12, 12), (10, 14), (14, 10), (8, 16)]
+    shown, failed = [], []
+
+    def watch():
+        try:
+            for _ in range(12):
+                before = session.scene
+                image = session.render(wait=False)
+                after = session.scene
+                shown.append(image.shape)
+                if before is after:
+                    assert image.shape == (after.height, after.width, 3)
+            session.render()
+        except Exception as error:
+            failed.append(error)
+
+    watching = threading.Thread(target=watch)
+    watching.start()
+    for i in range(8):
+        session.look(size=sizes[i % 4])
+        session.move("sphere", bright=0.02)
+        time.sleep(0.05)
+    watching.join(120.0)
+    assert not watching.is_alive()
+    assert not failed
+    assert session.render().shape == (8, 16, 3)
+    assert len(session.history) == 8
+
+
+def test_a_progress_callback_may_use_the_session_but_not_wait_for_itself(training):
+    session = EditSession(ball_scene(12, ground=False), "preview")
+    seen = []
+
+    def progress(stage, fraction):
+        if not seen:
+            seen.append(session.draft()[0].shape)
+            session.move("sphere", shiny=0.1)
+            seen.append(session.prepare(wait=False))
+            with pytest.raises(RuntimeError, match="another thread"):
+                session.render()
+            seen.append("told")
+
+    session._progress = progress
+    session.render()
+    assert seen == [(12, 12, 3), None, "told"]
+
+
+def test_a_session_that_is_gone_is_not_prepared(gate):
+    session = EditSession(ball_scene(12, ground=False), "preview", progress=gate)
+    session.prepare(wait=False)
+    job = session._view.job
+    assert gate.reached.wait(60.0)
+    view = session._view
+    del session
+    gate.opened.set()
+    ended(job)
+    assert view.transport is None
+
+
+@pytest.mark.parametrize("when", ["at once", "later"])
+def test_the_interpreter_ends_while_a_scene_is_prepared(when):
+    code = f"""
+import time, traitbrdf as tb
+scene = tb.Scene(tb.teapot(), tb.EnvironmentMap.sky(rows=32), size=64)
+edit = tb.EditSession(scene, "preview")
+edit.prepare(wait=False)
+time.sleep({0.0 if when == "at once" else 2.0})
+print("end", flush=True)
+"""
+    start = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
+    assert time.monotonic() - start < 90.0
+
+
+def test_turns_are_taken_by_those_who_are_waited_for_first():
+    turns, order = editing._Turns(), []
+    behind, urgent = object(), threading.Event()
+    turns.take("first", False, lambda: False)
+
+    def patient():
+        turns.take(behind, False, lambda: False)
+        order.append("behind")
+        turns.give(behind)
+
+    def pressing():
+        urgent.set()
+        with turns.urgent():
+            order.append("urgent")
+
+    threads = [threading.Thread(target=patient), threading.Thread(target=pressing)]
+    for thread in threads:
+        thread.start()
+    assert urgent.wait(10.0)
+    time.sleep(0.1)
+    turns.give("nobody")
+    assert order == []
+    turns.give("first")
+    for thread in threads:
+        thread.join(10.0)
+    assert order == ["urgent", "behind"]
+    stopped = threading.Event()
+    turns.take("first", True, stopped.is_set)
+    threading.Timer(0.05, lambda: (stopped.set(), turns.wake())).start()
+    with pytest.raises(editing._StopError):
+        turns.take("second", False, stopped.is_set)
+
+
+# -- frames that get better -------------------------------------------------------------------
+
+
+def test_frames_get_better():
+    session = EditSession(ball_scene(), "preview")
+    several = list(session.frames())
+    assert len(several) >= 2
+    images, errors, fractions = zip(*several, strict=True)
+    assert fractions[0] == 0.0
+    assert list(fractions) == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert max(fractions[:-1]) < 1.0
+    same(images[-1], session.render())
+    assert errors[-1] == session.report()["frame_error"]
+    assert [f for *_, f in session.frames()] == [1.0]  # all is done
+
+
+def test_closing_the_frames_cancels(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    frames = session.frames()
+    next(frames)
+    next(frames)
+    job = session._view.job
+    assert gate.reached.wait(60.0)
+    frames.close()
+    gate.opened.set()
+    ended(job)
+    assert job.stopped
+    assert not session.ready
+    assert session._view.job is None
+
+
+def test_frames_end_when_their_preparation_is_cancelled(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    count = 0
+    for _ in session.frames():
+        count += 1
+        if count == 3:
+            session.cancel()
+            gate.opened.set()
+    assert count == 3
+    assert not session.ready
+
+
+def test_frames_follow_edits_and_looks(gate):
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    frames = session.frames()
+    first, *_ = next(frames)
+    session.assign("sphere", "gold-polished")
+    second, *_ = next(frames)
+    assert not np.array_equal(first, second)
+    session.look(size=(10, 12))
+    gate.opened.set()
+    rest = list(frames)
+    assert {image.shape for image, *_ in rest} == {(10, 12, 3)}
+    assert rest[-1][2] == 1.0
+    same(rest[-1][0], session.render())
+
+
+def test_frames_raise_what_fails(gate):
+    gate.failure = FailureError("no light")
+    gate.opened.set()
+    session = EditSession(ball_scene(), "preview", progress=gate)
+    with pytest.raises(FailureError):
+        list(session.frames())
+
+
+# -- the cache --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A folder for preparations."""
+    folder = tmp_path / "there" / "cache"
+    monkeypatch.setenv("TRAITBRDF_CACHE", str(folder))
+    monkeypatch.delenv("TRAITBRDF_CACHE_BYTES")
+    return folder
+
+
+def written():
+    """Wait until what was prepared lies on the disk."""
+    for thread in threading.enumerate():
+        if thread.name == "traitbrdf-cache":
+            thread.join(60.0)
+
+
+def cache_session(**arguments):
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=12)
+    return EditSession(scene, "preview", **arguments)
+
+
+def test_a_preparation_is_found_again(cache):
+    first = cache_session()
+    frame = first.render()
+    written()
+    (file,) = cache.iterdir()
+    os.utime(file, (0, 0))
+    told = []
+    second = cache_session(progress=lambda *news: told.append(news))
+    same(second.render(), frame)
+    assert second.report()["prepared_from"] == "cache"
+    assert first.report()["prepared_from"] == "scratch"
+    assert told == [("reading", 1.0)]
+    assert file.stat().st_mtime > 1e9  # it has been used
+    for session in (first, second):
+        session.assign("sphere", "gold-polished")
+    same(second.render(), first.render())
+    assert cache_session(cache=False)._cache is None
+    third = EditSession(second.scene, "preview", seed=1)
+    third.prepare()
+    assert third.report()["prepared_from"] == "scratch"
+
+
+def test_a_key_names_all_that_a_preparation_depends_on():
+    light = tb.PointLight((3.0, 3.0, 3.0))
+    scene = ball_scene(lights=[light])
+
+    def key(scene=scene, library=LIBRARY, rank=24, resolution=0.7, seed=0):
+        return editing._cache_key(scene, library, rank, resolution, seed)
+
+    other = tb.Library(EMBEDDING, LIBRARY.names, LIBRARY.coordinates * 0.99, LIBRARY.families)
+    pot = tb.Scene(tb.teapot(), scene.environment, size=8)
+    vertices = pot.shape.vertices.copy()
+    vertices[99, 2] += 1e-3
+    bent = Mesh(vertices, pot.shape.faces, pot.shape.normals, pot.shape.face_part, pot.shape.parts)
+    keys = [
+        key(),
+        key(rank=25),
+        key(resolution=0.8),
+        key(seed=1),
+        key(library=other),
+        key(scene.changed(size=21)),
+        key(scene.changed(camera=tb.Camera.orbit(20.0, 26.0))),
+        key(scene.changed(environment=scene.environment.rotated(0.1))),
+        key(scene.changed(environment=scene.environment.scaled(1.01))),
+        key(scene.changed(lights=())),
+        key(scene.changed(lights=[tb.PointLight((3.0, 3.0, 3.1))])),
+        key(scene.changed(lights=[tb.PointLight((3.0, 3.0, 3.0), (1.0, 1.0, 0.9))])),
+        key(scene.changed(ground=False)),
+        key(scene.changed(ground=1.9)),
+        key(scene.changed(shadows=False)),
+        key(scene.changed(subsamples=4)),
+        key(pot),
+        key(tb.Scene(bent, scene.environment, size=8)),
+    ]
+    assert None not in keys
+    assert len(set(keys)) == len(keys)
+    assert key(ball_scene(lights=[light])) == keys[0]
+
+
+def test_a_shape_that_only_knows_itself_is_not_cached(cache):
+    class Own:
+        """Casts shadows that nobody else can tell."""
+
+        def __init__(self):
+            self._shape = tb.sphere()
+            self.parts, self.center, self.radius = ("own",), self._shape.center, 1.0
+            self.lowest, self.convex = -1.0, False
+
+        def intersect(self, origins, directions):
+            return self._shape.intersect(origins, directions)
+
+        def occluded(self, origins, directions, max_distance=math.inf):
+            return self._shape.occluded(origins, directions, max_distance)
+
+    scene = tb.Scene(Own(), tb.EnvironmentMap.sky(rows=16), size=8)
+    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0) is None
+    EditSession(scene, "preview").prepare()
+    written()
+    assert not cache.exists()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "other", "shape", "type", "empty", "folder"])
+def test_a_damaged_file_is_a_miss_and_goes(cache, damage):
+    session = cache_session()
+    frame = session.render()
+    written()
+    (file,) = cache.iterdir()
+    data = bytearray(file.read_bytes())
+    if damage == "cut":
+        file.write_bytes(data[: len(data) // 2])
+    elif damage == "flipped":
+        data[len(data) // 2] ^= 0xFF
+        file.write_bytes(data)
+    elif damage == "empty":
+        file.write_bytes(b"")
+    elif damage == "folder":
+        file.unlink()
+        file.mkdir()
+    else:
+        arrays = read_arrays(file)
+        if damage == "other":
+            arrays["pixels_0"] = arrays["pixels_0"] + 1
+        elif damage == "shape":
+            arrays["basis_0"] = arrays["basis_0"][:, :, :-1]
+        else:
+            arrays["rank"] = np.array("many")
+        write_arrays(file, arrays)
+    again = cache_session()
+    same(again.render(), frame)
+    assert again.report()["prepared_from"] == "scratch"
+    written()
+    if damage != "folder":
+        third = cache_session()
+        same(third.render(), frame)
+        assert third.report()["prepared_from"] == "cache"  # written anew
+
+
+def test_the_least_recently_used_go_first(tmp_path):
+    arrays = {"numbers": np.zeros(1000)}  # some 8.3 kB in a file
+    cache = editing._Cache(tmp_path / "a" / "b", 30_000)
+    for i, name in enumerate("abc"):
+        cache.write(name, arrays)
+        os.utime(cache._file(name), (1000 + i, 1000 + i))
+    assert cache.read("a") is not None  # now the youngest
+    cache.write("d", arrays)
+    assert {p.stem for p in cache.folder.iterdir()} == {"a", "c", "d"}
+    same(cache.read("c")["numbers"], arrays["numbers"])
+    cache.write("e", {"numbers": np.zeros(4000)})  # larger than all that is allowed
+    assert {p.stem for p in cache.folder.iterdir()} == {"a", "c", "d"}
+    (cache.folder / ".left.tmp.npz").write_bytes(bytes(20_000))
+    os.utime(cache.folder / ".left.tmp.npz", (1, 1))
+    cache.write("f", arrays)
+    assert not (cache.folder / ".left.tmp.npz").exists()
+    assert cache.read("never") is None
+
+
+def test_where_the_cache_lies(monkeypatch, tmp_path):
+    usual = editing._Cache.usual
+    assert usual() is None  # the tests have it off
+    monkeypatch.delenv("TRAITBRDF_CACHE_BYTES")
+    monkeypatch.setenv("TRAITBRDF_CACHE", str(tmp_path))
+    assert (usual().folder, usual().limit) == (tmp_path, editing.CACHE_BYTES)
+    monkeypatch.delenv("TRAITBRDF_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert usual().folder == tmp_path / "traitbrdf"
+    monkeypatch.setenv("XDG_CACHE_HOME", "cache")  # its specification: relative ones do not count
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert usual().folder == tmp_path / "home" / ".cache" / "traitbrdf"
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    assert usual() is None
+    monkeypatch.setenv("TRAITBRDF_CACHE_BYTES", "1e6")
+    with pytest.raises(ValueError, match=r"TRAITBRDF_CACHE_BYTES: expected .* got '1e6'"):
+        usual()
+    monkeypatch.setenv("TRAITBRDF_CACHE_BYTES", "1000")
+    monkeypatch.setenv("TRAITBRDF_CACHE", str(tmp_path))
+    assert usual().limit == 1000
+
+
+def test_a_folder_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"no folder")
+    monkeypatch.setenv("TRAITBRDF_CACHE", str(tmp_path / "file"))
+    monkeypatch.delenv("TRAITBRDF_CACHE_BYTES")
+    session = cache_session()
+    session.render()
+    written()
+    assert session.report()["prepared_from"] == "scratch"
+    assert (tmp_path / "file").read_bytes() == b"no folder"
+
+
+def test_a_disk_that_is_full_costs_nothing(cache, monkeypatch):
+    def full(file, **arrays):
+        file.write(b"half of it")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez", full)
+    cache_session().render()
+    written()
+    assert list(cache.iterdir()) == []
+
+
+# -- outside the basis ------------------------------------------------------------------------
+
+METALS = ("polished-metal", "brushed-metal", "rough-metal", "metallic-paint", "car-paint",
+          "anodised-metal")  # fmt: skip
+CLOTH = ("fabric", "velvet", "silk")
+
+
+def without(families):
+    """Training tables of a library that lacks some families."""
+    kept = [i for i, family in enumerate(LIBRARY.families) if family not in families][::4]
+    channels = [EMBEDDING.decode_values(LIBRARY.coordinates[i]) for i in kept]
+    return Training(np.concatenate(channels, axis=1), np.ones(3 * len(kept)))
+
+
+@pytest.fixture(scope="module", params=[METALS, CLOTH], ids=["metals", "cloth"])
+def lacking(request):
+    """A transport that was never shown some families, their tables, and how they truly look."""
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=32), size=32)
+    built = Transport(scene, EMBEDDING.grid_, without(request.param), rank=24)
+    names = [n for n, f in zip(LIBRARY.names, LIBRARY.families, strict=True) if f in request.param]
+    names = np.random.default_rng(0).choice(names, 24, replace=False).tolist()
+    tables = [EMBEDDING.decode_values(LIBRARY.coordinates[LIBRARY.index(n)]) for n in names]
+    return built, dict(zip(names, zip(tables, truths(built, tables), strict=True), strict=True))
+
+
+def truths(built, tables):
+    """(P, 3) radiance of part 0 for each table, by exact rows."""
+    images = built.operator.images(
+        np.arange(len(built.scene.pixels)), np.concatenate(tables, axis=1)
+    )
+    return [np.stack([images[:, c, 3 * i + c] for c in range(3)], 1) for i in range(len(tables))]
+
+
+def true_error(radiance, truth):
+    return float(np.abs(np.asarray(radiance) - truth).mean() / truth.mean())
+
+
+def lacking_session(lacking, monkeypatch, **arguments):
+    built, known = lacking
+    monkeypatch.setitem(editing.QUALITIES, "preview", (24, 1.0))
+    return over(built, **arguments), known
+
+
+def test_edits_to_a_family_that_the_basis_has_not_seen_are_detected(lacking):
+    built, known = lacking
+    true, measured = [], []
+    for table, truth in known.values():
+        frame = built.shade(0, torch.from_numpy(table[built.cells]))
+        true.append(true_error(frame.radiance, truth))
+        measured.append(frame.error)
+    beyond = np.asarray(true) > editing.EXACT_ABOVE
+    assert beyond.sum() >= 5
+    assert (np.asarray(measured)[beyond] > editing.TRUSTED * editing.EXACT_ABOVE).all()
+
+
+def test_what_is_shown_of_them_is_right(lacking, monkeypatch):
+    session, known = lacking_session(lacking, monkeypatch)
+    tiers = []
+    for name, (_, truth) in known.items():
+        session.assign("sphere", name)
+        session.render()
+        (shown,) = session._view.shown
+        tiers.append(shown.tier)
+        assert true_error(shown.frame.radiance, truth) <= 0.01
+    assert tiers.count("exact") >= 3
+    report = session.report()
+    assert report["exact_frames"] == tiers.count("exact")
+    assert 1 <= report["trained_images"]["sphere"] <= editing.TRAINED_IMAGES
+
+
+def test_edits_near_an_exact_frame_are_shown_by_the_basis(lacking, monkeypatch):
+    session, known = lacking_session(lacking, monkeypatch)
+    transport = session.prepare()
+    worst = max(known, key=lambda n: transport.shade(
+        0, torch.from_numpy(known[n][0][transport.cells])).error)  # fmt: skip
+    session.assign("sphere", worst)
+    frame = session.render()
+    assert session.report()["parts"]["sphere"]["tier"] == "exact"
+    for amount in (0.03, -0.05, 0.04):
+        session.move("sphere", shiny=amount)
+        session.render()
+        (shown,) = session._view.shown
+        assert shown.tier == "trained"
+        assert shown.frame.error <= 0.007
+        values = session.brdf("sphere").values.reshape(-1, 3)
+        assert true_error(shown.frame.radiance, truths(transport, [values])[0]) <= 0.01
+    assert session.report()["exact_frames"] == 1
+    for _ in range(3):
+        session.undo()
+    same(session.render(), frame)  # what was shown exactly
+
+
+def test_a_part_takes_only_so_many_images(lacking, monkeypatch):
+    monkeypatch.setattr(editing, "TRAINED_IMAGES", 2)
+    session, known = lacking_session(lacking, monkeypatch, error=0.003)
+    trained = []
+    plain = Transport.train
+    monkeypatch.setattr(
+        Transport, "train", lambda self, *given: trained.append(given) or plain(self, *given)
+    )
+    for name in known:
+        session.assign("sphere", name)
+        session.render()
+    assert session.report()["exact_frames"] > 2
+    assert len(trained) <= 2
+
+
+def test_an_error_that_cannot_be_met_is_never_trained_for(fresh, monkeypatch):
+    monkeypatch.setattr(Transport, "train", None)
+    asked = fresh(error=1e-9)
+    asked.assign("body", "chrome")
+    asked.assign("lid", PerfectMirror(0.5) + 0.5 * Lambert(0.5))
+    image = asked.render().reshape(-1, 3)
+    report = asked.report()
+    scene, transport = asked.scene, asked.prepare()
+    for i, part in enumerate(scene.parts):
+        assert report["parts"][part]["tier"] == "exact"
+        brdf = asked.brdf(part)
+        mirror = torch.from_numpy(brdf.mirror.astype(np.float32))
+        true = transport.shade_exactly(i, brdf.values.reshape(-1, 3), mirror).radiance
+        alone = scene.weights[scene.part_slice(i)] == 1.0
+        same(image[scene.pixels[scene.part_slice(i)][alone]], true.numpy()[alone])
+    assert report["trained_images"] == {}
+    assert report["exact_frames"] == len(scene.parts)
+
+
+def test_by_default_parts_beyond_a_hundredth_are_exact(fresh, monkeypatch):
+    noise = np.exp(2.0 * np.random.default_rng(0).normal(size=(*EMBEDDING.grid_.shape, 3)))
+    wild = tb.TabulatedBRDF(EMBEDDING.grid_, noise.astype(np.float32))
+    edit = fresh(error=None)
+    edit.assign("handle", wild)
+    edit.render()
+    report = edit.report()
+    assert report["error_asked"] == editing.EXACT_ABOVE == 0.01
+    assert report["parts"]["handle"]["tier"] == "exact"
+    basis = edit.prepare()
+    for i, part in enumerate(edit.scene.parts):
+        entry = report["parts"][part]
+        if entry["tier"] == "basis":
+            assert entry["error"] <= edit._allowed(edit._view, i)
+    assert basis is edit.prepare()
+
+
+# -- gradients --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", ["library", "table", "coordinates"])
+def test_gradients_agree(prepared_ball, start):
+    """Closed form, autograd and central differences."""
+    session = over(prepared_ball, error=1.0)
+    if start == "library":
+        session.assign("sphere", "blue-plastic")
+    elif start == "table":
+        session.assign("sphere", GGX(0.2, 1.5, 0.0) + PerfectMirror(0.1))
+        session.move("sphere", rough=0.05)
+    else:
+        session.assign("sphere", 0.5 * (EMBEDDING.low_ + EMBEDDING.high_))
+    pixels, slopes = session.gradient("sphere")
+    scene = session.scene
+    z = session.material("sphere").z
+    same(pixels, scene.pixels[scene.part_slice(0)])
+    assert slopes.shape == (len(pixels), 3, len(z))
+    assert slopes.dtype == np.float32
+    scale = np.abs(slopes).max(axis=(0, 1))
+    assert scale.min() > 0.0
+
+    def shown(z):
+        return session.radiance("sphere", z)
+
+    by_autograd = torch.autograd.functional.jacobian(shown, torch.from_numpy(z.astype(np.float32)))
+    assert by_autograd.shape == slopes.shape
+    assert (np.abs(by_autograd.numpy() - slopes).max(axis=(0, 1)) <= 1e-3 * scale).all()
+    rng = np.random.default_rng(1)
+    low, high = EMBEDDING.low_ - z, EMBEDDING.high_ - z
+    for _ in range(5):
+        way = rng.normal(size=len(z))
+        way[(low > -0.1) | (high < 0.1)] = 0.0  # off the walls, where the slope has two sides
+        way /= np.linalg.norm(way)
+        step = 1e-3
+        ahead, behind = (shown(torch.from_numpy(z + s * way)).numpy() for s in (step, -step))
+        slope = slopes @ way
+        assert np.abs((ahead - behind) / (2 * step) - slope).max() <= 0.01 * np.abs(slope).max()
+    # and it is the frame's
+    frame = session.render().reshape(-1, 3)[pixels]
+    alone = scene.weights[scene.part_slice(0)] == 1.0
+    now = shown(torch.from_numpy(z)).clamp_min(0.0).numpy()
+    np.testing.assert_allclose(frame[alone], now[alone], rtol=1e-3, atol=1e-5)
+
+
+def test_gradients_of_a_part_that_is_out_of_view(training):
+    scene = tb.Scene(tb.teapot(), tb.EnvironmentMap.sky(rows=16), size=10)
+    session = EditSession(scene, "preview", error=1.0)
+    hidden = [p for i, p in enumerate(scene.parts) if scene.part_slice(i) == slice(0, 0)] or [
+        "bottom"
+    ]
+    pixels, slopes = session.gradient(hidden[0])
+    assert slopes.shape == (len(pixels), 3, EMBEDDING.size)
+    with pytest.raises(ValueError, match="'handle'"):
+        session.gradient("hanlde")
+    with pytest.raises(ValueError, match="z: expected shape"):
+        session.radiance("body", torch.zeros(5))
+
+
+# -- devices ----------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_graphics_card_shows_the_same(prepared_ball):
+    frames, slopes = [], []
+    for device in ("cpu", "cuda"):
+        session = EditSession(prepared_ball.scene, "preview", device=device)
+        session._view.transport = Transport.restored(
+            prepared_ball.scene, EMBEDDING.grid_, prepared_ball.arrays(), device
+        )
+        session.assign("sphere", "gold-satin")
+        session.render()
+        session.assign("sphere", PerfectMirror(0.3) + Lambert(0.4))
+        session.move("ground", bright=0.2)
+        frames.append(session.render())
+        session.undo()
+        slopes.append(session.gradient("sphere")[1])
+        assert session.report()["device"] == device
+    np.testing.assert_allclose(frames[1], frames[0], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-3, atol=1e-3 * np.abs(slopes[0]).max())

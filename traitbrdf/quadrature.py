@@ -37,7 +37,7 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.brdf import HalfDiffGrid
 from traitbrdf.directions import reflect
-from traitbrdf.lights import LightTree, turn_about_y
+from traitbrdf.lights import EnvironmentMap, LightTree, turn_about_y
 from traitbrdf.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -48,10 +48,12 @@ Progress = Callable[[str, float], None]
 
 _SPLIT = (0.15, 0.35)
 """theta_h in radians between which the window passes from near to far."""
-_OUTLINE = 0.05
+_OUTLINE = 0.03
 """theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
 _LEVELS = (4, 2)
 """Spacing in pixels of the lattices on which far images are computed."""
+_CUT = (0.1, 1 / 300)
+"""Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
 _BEND = (0.006, 0.12)
 """Most that a normal departs from its cell's corners': from their mean, and from any."""
 _UNEVEN = 0.02
@@ -85,7 +87,7 @@ class VisibilityCut:
     neighbours: NDArray[np.int32]
 
     @classmethod
-    def build(cls, tree: LightTree, spacing: float = 0.1, share: float = 1 / 300) -> VisibilityCut:
+    def build(cls, tree: LightTree, spacing: float, share: float) -> VisibilityCut:
         """Cut where nodes are no wider than `spacing` and hold no more than `share` of the flux."""
         flux = np.linalg.norm(tree.moment.sum(axis=1, dtype=np.float64), axis=-1)
         whole = (tree.child < 0).all(axis=1)
@@ -110,7 +112,7 @@ class Operator:
     grid : HalfDiffGrid of the "folded" layout
     resolution : float
         1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
-    tree : LightTree of the scene's map, if it is at hand
+    tree : LightTree of the scene's map, from another operator under the same map
     """
 
     def __init__(
@@ -127,9 +129,10 @@ class Operator:
         self.scene = scene
         self.grid = grid
         self.resolution = resolution
-        self.tree = LightTree.build(scene.environment) if tree is None else tree
+        environment = _divided(scene.environment)
+        self.tree = LightTree.build(environment) if tree is None else tree
         self._nodes = _pack(self.tree)
-        self._image = scene.environment.image
+        self._image = environment.image
         scale = 1.0 / resolution
         rule = np.array([0.5 * scale, scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
         self._rules = np.stack([rule, rule * (1.6, 2.56, 1.6, 1.6)]).astype(np.float32)
@@ -141,7 +144,9 @@ class Operator:
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
         self._visibility: _Visibility | None = None
         if any(scene.casts):
-            cut = VisibilityCut.build(self.tree, 0.1 * scale, scale**2 / 300.0)
+            cut = VisibilityCut.build(
+                self.tree, _CUT[0] * min(scale, 1.0), _CUT[1] * min(scale, 1.0) ** 2
+            )
             self._visibility = _Visibility(scene, cut, self._middle)
         self._plans: dict[int, _Plan] = {}
 
@@ -266,7 +271,7 @@ class Operator:
         cut, masks = _NO_CUT, _NO_MASKS
         if self._visibility is not None:
             cut = (self._visibility.cut.first, self._visibility.cut.last)
-            masks = self._visibility.prefix
+            masks = self._visibility.masks
         return (
             *self._nodes, self._image, *cut, *masks, self._rules,
             f32(low), f32(high if high < 1.0 else 9.0), f32(math.sin(_OUTLINE)),
@@ -313,20 +318,20 @@ class Operator:
         ask = np.empty((groups, _QUESTIONS, 3), np.float32)
         answers = np.ones((groups, _QUESTIONS), np.uint8)
         rest = (capacity, *self.grid.shape, tables)
-        _shade(
+        _shade(  # type: ignore[call-arg]  # numba's decorator hides the signature
             out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
         )  # fmt: skip
         again = (asked > 0) & ~short
         if again.any():
-            toward, which = _questions(ask[again], asked[again])
-            toward = turn_about_y(toward, self.scene.environment.rotation)
+            local, which = _questions(ask[again], asked[again])
+            toward = turn_about_y(local, self.scene.environment.rotation)
             some = bundles.take(again)
             # the middle member of a group asks for all
             middle = (some.group_start[:-1] + some.group_start[1:]) // 2
             answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
             answers[which] = self.scene.visible(some.sample[middle][which[0]], toward)
             count = len(some.several)
-            _shade(
+            _shade(  # type: ignore[call-arg]  # numba's decorator hides the signature
                 out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
                 *some.for_the_walk(), *light, *rest,
             )  # fmt: skip
@@ -342,10 +347,10 @@ class Operator:
                 sample, owner, share = scene.samples(index[at])
                 toward, irradiance = scene.arriving(light, sample)
                 leaves = np.zeros((len(sample), 13, 1), np.float32)
-                toward = scene.environment.to_map(toward)
-                leaves[:, :3, 0] = toward
+                local = scene.environment.to_map(toward)
+                leaves[:, :3, 0] = local
                 # the vector irradiance of a light: what faces it fully gets it fully
-                leaves[:, 3:12, 0] = (irradiance[:, :, None] * toward[:, None, :]).reshape(-1, 9)
+                leaves[:, 3:12, 0] = (irradiance[:, :, None] * local[:, None, :]).reshape(-1, 9)
                 starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
                 _one_leaf(
                     out[at], starts, self._normals[sample], self._views[sample],
@@ -383,7 +388,8 @@ class Operator:
 
     def _plan(self, part: int, report: Progress) -> _Plan:
         if part not in self._plans:
-            self._plans[part] = _Plan.make(self.scene, part, self._visibility, report)
+            loose = max(1.0, 1.0 / self.resolution)
+            self._plans[part] = _Plan.make(self.scene, part, self._visibility, loose, report)
         return self._plans[part]
 
 
@@ -488,13 +494,12 @@ def _first_rows(group_start: Int64, masks: NDArray[np.int32]) -> NDArray[np.int3
     return rows
 
 
-def _questions(
-    ask: Float32, asked: Int64
-) -> tuple[Float64, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _questions(ask: Float32, asked: Int64) -> tuple[Float64, tuple[Int64, Int64]]:
     """Unit directions of all questions, and (sample, question) of each."""
-    which = np.nonzero(np.arange(ask.shape[1]) < asked[:, None])
-    toward = ask[which].astype(np.float64)
-    return toward / np.linalg.norm(toward, axis=-1, keepdims=True), which
+    sample, question = np.nonzero(np.arange(ask.shape[1]) < asked[:, None])
+    toward = ask[sample, question].astype(np.float64)
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    return toward, (sample.astype(np.int64), question.astype(np.int64))
 
 
 class _Visibility:
@@ -509,7 +514,8 @@ class _Visibility:
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
         self._middle = middle
         self._bits = np.zeros((0, len(cut.share)), np.uint8)
-        self._prefix = tuple(np.zeros((0, len(cut.share) + 1), np.int16) for _ in range(3))
+        words = (len(cut.share) + 63) // 64
+        self._masks = tuple(np.zeros((0, words), np.uint64) for _ in range(3))
 
     @property
     def bits(self) -> NDArray[np.uint8]:
@@ -517,10 +523,10 @@ class _Visibility:
         return self._bits[: self.rows]
 
     @property
-    def prefix(self) -> tuple[NDArray[np.int16], ...]:
-        """Counts (rows, D + 1) of nodes before each that are: hidden; not surely visible; not
+    def masks(self) -> tuple[NDArray[np.uint64], ...]:
+        """Sets (rows, words) of nodes, 64 a word, that are: hidden; not surely visible; not
         surely hidden. Sure is a node whose neighbours on the sphere agree with it."""
-        return self._prefix
+        return self._masks
 
     def cast(
         self, index: Int64, around: NDArray[np.int32], least: int, verify: bool = False
@@ -548,12 +554,12 @@ class _Visibility:
     def _append(self, bits: NDArray[np.uint8], index: Int64) -> None:
         need = self.rows + len(index)
         if need > len(self._bits):
-            size = max(need, 2 * len(self._bits))
+            size = max(need, len(self._bits) * 5 // 4)
             self._bits = _grown(self._bits, size)
-            self._prefix = tuple(_grown(a, size) for a in self._prefix)
+            self._masks = tuple(_grown(a, size) for a in self._masks)
         rows = slice(self.rows, need)
         self._bits[rows] = bits
-        _count(bits, self.cut.neighbours, *(a[rows] for a in self._prefix))
+        _pack_bits(bits, self.cut.neighbours, *(a[rows] for a in self._masks))
         self.rows = need
         self.row_of[index] = np.arange(rows.start, rows.stop)
 
@@ -588,7 +594,12 @@ class _Plan:
 
     @classmethod
     def make(
-        cls, scene: Scene, part: int, visibility: _Visibility | None, report: Progress
+        cls,
+        scene: Scene,
+        part: int,
+        visibility: _Visibility | None,
+        loose: float,
+        report: Progress,
     ) -> _Plan:
         span = scene.part_slice(part)
         count = span.stop - span.start
@@ -608,7 +619,7 @@ class _Plan:
             some, around = some[new], around[new]
             if casts is not None and len(some):
                 rows = np.where(around >= 0, casts.row_of[span][around], -1).astype(np.int32)
-                casts.cast(some + span.start, rows, least, verify)
+                casts.cast(some + span.start, rows, least, verify and loose == 1.0)
             known[some] = True
 
         if casts is not None:
@@ -636,9 +647,9 @@ class _Plan:
                 look(on, around[on], 2, verify=True)
             found, weight = lattice.cell(open_, level)
             ok = (weight != 0.0).any(axis=1)
-            ok &= _predictable(normals, open_, found, weight)
+            ok &= _predictable(normals, open_, found, weight, loose)
             if casts is not None:
-                ok &= _shadows_agree(casts, span, normals, open_, found, sharp)
+                ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
             good = open_[ok]
             corners[good] = np.where(found[ok] >= 0, found[ok], good[:, None])
             weights[good] = weight[ok]
@@ -724,14 +735,16 @@ class _Lattice:
         return corners, weights
 
 
-def _predictable(normals: Float64, some: Int64, corners: Int64, weights: Float64) -> NDArray[Any]:
+def _predictable(
+    normals: Float64, some: Int64, corners: Int64, weights: Float64, loose: float
+) -> NDArray[Any]:
     """Whether normals vary so linearly over a cell that images of wide lobes do."""
     at = np.where(corners >= 0, corners, some[:, None])
     around = normals[at]
     own = normals[some]
     off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
     spread = np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
-    answer: NDArray[Any] = (off < _BEND[0]) & (spread < _BEND[1])
+    answer: NDArray[Any] = (off < loose * _BEND[0]) & (spread < loose * _BEND[1])
     return answer
 
 
@@ -761,6 +774,7 @@ def _shadows_agree(
     some: Int64,
     corners: Int64,
     sharp: tuple[NDArray[np.int64], NDArray[np.bool_]] | None,
+    loose: float,
 ) -> NDArray[np.bool_]:
     """Whether the corners of a fragment's cell are lit alike."""
     rows = np.where(corners >= 0, visibility.row_of[span][corners], -1).astype(np.int32)
@@ -772,7 +786,7 @@ def _shadows_agree(
         unlike, visibility.bits, cells, normals[some[first]],
         visibility.toward, visibility.cut.share,
     )  # fmt: skip
-    agree: NDArray[np.bool_] = (unlike < _UNEVEN)[which.reshape(-1)]
+    agree: NDArray[np.bool_] = (unlike < loose * _UNEVEN)[which.reshape(-1)]
     if sharp is not None:
         nodes, own = sharp
         for k, node in enumerate(nodes):
@@ -781,6 +795,16 @@ def _shadows_agree(
             same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
             agree &= same.all(axis=1)
     return agree
+
+
+def _divided(environment: EnvironmentMap) -> EnvironmentMap:
+    """The same light with at least 16 rows: texels that are small angles."""
+    rows, columns, _ = environment.image.shape
+    down, across = -(-16 // rows), -(-32 // columns)
+    if down == across == 1:
+        return environment
+    image = environment.image.repeat(down, axis=0).repeat(across, axis=1)
+    return EnvironmentMap(image, environment.rotation)
 
 
 def _near_window(grid: HalfDiffGrid) -> Float32:
@@ -807,7 +831,7 @@ _NO_TABLES = np.zeros((1, 0), np.float32)
 _UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
 
 _NO_CUT = (np.zeros(1, np.int32), np.zeros(1, np.int32))
-_NO_MASKS = tuple(np.zeros((1, 2), np.int16) for _ in range(3))
+_NO_MASKS = tuple(np.zeros((1, 1), np.uint64) for _ in range(3))
 
 
 # The loops below are what torch cannot express: tree descents, and sums over lists of uneven
@@ -880,27 +904,44 @@ def _inherit(bits: Any, normals: Any, toward: Any, known: Any, around: Any, leas
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
-def _count(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: Any) -> None:
-    """Running counts of nodes that are hidden, not surely visible, not surely hidden."""
+def _pack_bits(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: Any) -> None:
+    """Sets of nodes that are hidden, not surely visible, not surely hidden."""
     for p in numba.prange(len(bits)):
-        a, b, c = 0, 0, 0
+        hidden[p] = 0
+        unseen[p] = 0
+        unhidden[p] = 0
         for d in range(bits.shape[1]):
-            hidden[p, d], unseen[p, d], unhidden[p, d] = a, b, c
             own = bits[p, d]
             some_seen, some_hidden = own != 0, own != 1
-            if own == 2:
-                some_hidden = True
             for k in range(neighbours.shape[1]):
                 other = bits[p, neighbours[d, k]]
                 if other == 1:
                     some_seen = True
                 elif other == 0:
                     some_hidden = True
-            a += own == 0
-            b += some_hidden
-            c += some_seen
-        d = bits.shape[1]
-        hidden[p, d], unseen[p, d], unhidden[p, d] = a, b, c
+            one = np.uint64(1) << np.uint64(d & 63)
+            if own == 0:
+                hidden[p, d >> 6] |= one
+            if some_hidden:
+                unseen[p, d >> 6] |= one
+            if some_seen:
+                unhidden[p, d >> 6] |= one
+
+
+@numba.njit(cache=True, inline="always")
+def _some(words: Any, row: Any, start: Any, stop: Any, wanted: Any) -> Any:
+    """Whether any of the bits start to stop - 1 of a row is `wanted`."""
+    ones = np.uint64(0xFFFFFFFFFFFFFFFF)
+    low, high = start >> 6, (stop - 1) >> 6
+    found = False
+    for k in range(low, high + 1):
+        word = words[row, k] if wanted else ~words[row, k]
+        if k == low:
+            word &= ones << np.uint64(start & 63)
+        if k == high:
+            word &= ones >> np.uint64(63 - ((stop - 1) & 63))
+        found |= word != np.uint64(0)
+    return found
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -1039,7 +1080,7 @@ def _walk(
             r = f32(0.5) * f32(math.sqrt(dt * dt + df * df))
             variance = r * r / f32(6.0)
         else:
-            i = np.int64(stack[top])
+            i = int(stack[top])
             top -= 1
             cx, cy, cz = place[i, 0], place[i, 1], place[i, 2]
             r, variance = place[i, 3], place[i, 4]
@@ -1061,37 +1102,32 @@ def _walk(
             if fate == _UNKNOWN:
                 d0, d1 = first[i], last[i]
                 if nearest > outline:
-                    blocked = 0
+                    some_hidden, some_lit = False, False
                     for k in range(rows):
-                        blocked += hidden[mask[k], d1] - hidden[mask[k], d0]
-                    if blocked == rows * (d1 - d0):
+                        some_hidden |= _some(hidden, mask[k], d0, d1, True)
+                        some_lit |= _some(hidden, mask[k], d0, d1, False)
+                    if not some_lit:
                         continue
-                    if blocked == 0:
+                    if not some_hidden:
                         fate = _LIT
                     elif d1 - d0 == 1:
-                        seen = f32(1.0) - f32(blocked) / f32(rows)
                         fate = _PARTLY
                 else:
-                    not_seen, not_hidden = 0, 0
+                    some_hidden, some_lit = False, False
                     for k in range(rows):
-                        q = mask[k]
-                        not_seen += unseen[q, d1] - unseen[q, d0]
-                        not_hidden += unhidden[q, d1] - unhidden[q, d0]
-                    if not_hidden == 0:
+                        some_hidden |= _some(unseen, mask[k], d0, d1, True)
+                        some_lit |= _some(unhidden, mask[k], d0, d1, True)
+                    if not some_lit:
                         continue
-                    if not_seen == 0:
+                    if not some_hidden:
                         fate = _LIT
                     elif d1 - d0 == 1:
                         fate = _DOUBTFUL
-            elif fate == _PARTLY:
-                blocked = 0
+            seen = f32(1.0)
+            if fate == _PARTLY:
                 for k in range(rows):
-                    blocked += hidden[mask[k], last[i]] - hidden[mask[k], first[i]]
-                seen = f32(1.0) - f32(blocked) / f32(rows)
-            else:
-                seen = f32(1.0)
-            if fate in (_LIT, _DOUBTFUL):
-                seen = f32(1.0)
+                    if _some(hidden, mask[k], first[i], last[i], True):
+                        seen -= f32(1.0) / f32(rows)
         if in_texel:
             half, _ = _turned(f32(0.5) * (t1 - t0), f32(0.0), f32(1.0))
             omega = f32(2.0) * st * half * (f1 - f0)

@@ -207,7 +207,7 @@ class Transport:
         total = max(len(scene.pixels), 1)
         sizes = [len(range(*scene.part_slice(p).indices(total))) for p in range(len(scene.parts))]
         shown = [part for part, size in enumerate(sizes) if size]
-        self.parts = [None] * len(sizes)
+        self.parts += [None] * len(sizes)
         # the next part's rays are cast while this one is shaded
         cancelled = threading.Event()
 
@@ -622,18 +622,18 @@ class Draft:
         scene: Scene,
         grid: HalfDiffGrid,
         size: int = 128,
-        resolution: float = 0.6,
+        resolution: float = 0.25,
         tree: LightTree | None = None,
         seed: int = 0,
     ) -> None:
         scale = min(1.0, size / max(scene.height, scene.width))
         shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
-        self.scene = scene.changed(size=shape, subsamples=min(4, scene.subsamples))
+        self.scene = scene.changed(size=shape, subsamples=1)
         self.operator = Operator(self.scene, grid, resolution, tree)
         count = len(self.scene.pixels)
         rng = np.random.default_rng(seed)
         self._probes = np.sort(rng.permutation(count)[: self.PROBES])
-        exact = Operator(self.scene, grid, 2.0 * resolution, self.operator.tree)
+        exact = Operator(self.scene, grid, 1.0, self.operator.tree)
         self._rows = exact.rows(self._probes)
 
     def render(

@@ -1,0 +1,599 @@
+"""Rows of the operator: against the oracle, in light and in shadow."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from traitbrdf import reference
+from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.directions import reflect
+from traitbrdf.embedding import GRID, default_library
+from traitbrdf.lights import DirectionalLight, EnvironmentMap, LightTree, PointLight, texel_moments
+from traitbrdf.models import GGX, Lambert
+from traitbrdf.quadrature import Operator, VisibilityCut
+from traitbrdf.scene import Camera, Scene
+from traitbrdf.shapes import sphere, teapot
+
+LIBRARY = default_library()
+NAMES = ("chrome", "blue-plastic", "green-felt", "red-rubber", "gold-satin", "white-plaster")
+TABLES = [LIBRARY[name] for name in NAMES]
+MANY = [LIBRARY[name] for name in LIBRARY.names[1::20]]
+GREY = np.full((GRID.size, 1), 1.0 / math.pi, np.float32)
+"""A Lambert surface of albedo 1."""
+
+
+def flat(table):
+    """(cells, 3) of a table on the grid."""
+    return np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
+
+
+def by_rows(operator, index, tables):
+    """(m, B, 3) radiance by the rows of fragments, in float64."""
+    columns = np.stack([flat(t) for t in tables], axis=1).astype(np.float64)
+    rows = operator.rows(index).astype(np.float64)
+    return np.einsum("pck,kbc->pbc", rows, columns, optimize=True)
+
+
+def diagonal(images):
+    """(m, T, 3) of images (m, 3, 3 T): each colour of the light under its own channel."""
+    each = images.reshape(*images.shape[:2], -1, 3)
+    return np.einsum("pctc->ptc", each)
+
+
+def by_images(operator, index, tables):
+    """The same by the images of the tables' channels."""
+    return diagonal(operator.images(index, channels(tables)))
+
+
+def channels(tables):
+    return np.concatenate([flat(t) for t in tables], axis=1)
+
+
+def errors(shown, true):
+    """(B,) mean relative L1 of radiance (m, B, 3)."""
+    return np.abs(shown - true).mean(axis=(0, 2)) / true.mean(axis=(0, 2))
+
+
+def some(scene, count, seed=0, bordering=None, part=None):
+    """Random fragments: all kinds, or those in pixels at a border, or not; of a part."""
+    chosen = np.ones(len(scene.pixels), bool)
+    if bordering is not None:
+        chosen &= scene.bordering == bordering
+    if part is not None:
+        chosen &= scene.pixel_part == scene.parts.index(part)
+    index = np.flatnonzero(chosen)
+    return np.sort(np.random.default_rng(seed).choice(index, count, replace=False))
+
+
+def noise(rows, columns, seed=0, **settings):
+    image = np.random.default_rng(seed).uniform(0.1, 3.0, (rows, columns, 3))
+    return EnvironmentMap(image, **settings)
+
+
+def one_texel(row, column, rows, bright=1e4, rest=1e-3):
+    """A map with all its light, but for a faint rest, in one texel."""
+    image = np.full((rows, 2 * rows, 3), rest)
+    image[row, column] = bright
+    return EnvironmentMap(image)
+
+
+def shadowed(scene, index, count=256):
+    """Which fragments get less than nine tenths of the light that the horizon leaves them."""
+    toward = np.random.default_rng(9).normal(size=(count, 3))
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    light = scene.environment.radiance(toward).mean(axis=-1)
+    sample = scene.offsets[:-1][index]
+    cos = np.maximum(scene.normals[sample] @ toward.T, 0.0)
+    free = np.stack([scene.visible(sample, np.broadcast_to(w, (len(sample), 3))) for w in toward])
+    return (cos * light * free.T).sum(axis=1) < 0.9 * (cos * light).sum(axis=1)
+
+
+@functools.cache
+def ball_on_ground(size=40, rows=32, **settings):
+    sky = EnvironmentMap.sky(rows=rows)
+    return Scene(sphere(), sky, camera=Camera.orbit(20.0, 25.0), size=size, ground=True, **settings)
+
+
+@functools.cache
+def teapot_on_ground(size=48):
+    lights = [
+        PointLight(position=(3.0, 4.0, 3.0), intensity=(20.0, 18.0, 15.0)),
+        DirectionalLight(direction=(-1.0, 2.0, 0.7), irradiance=(0.3, 0.4, 0.6)),
+    ]
+    sky = EnvironmentMap.sky(rows=64).rotated(0.7)
+    camera = Camera.orbit(35.0, 25.0)
+    return Scene(teapot(), sky, lights, camera, size=(size, size + 12), ground=True)
+
+
+# -- against the oracle -----------------------------------------------------------------------
+
+
+def test_rows_without_shadows(small_teapot):
+    """Sharp and rough tables under a map and two lights beside it."""
+    scene = small_teapot.changed(shadows=False)
+    tables = TABLES + [TabulatedBRDF.from_model(m, GRID) for m in (GGX(0.01, 1.5, 0.0), Lambert(1))]
+    index = np.concatenate([some(scene, 10, bordering=False), some(scene, 4, bordering=True)])
+    true, own = reference.fragments(scene, index, tables, 1e-3)
+    shown = by_rows(Operator(scene, GRID), index, tables)
+    assert np.all(errors(shown, true) < 0.003)
+    level = true.max(axis=(1, 2), keepdims=True)
+    assert np.all(np.abs(shown - true) < 0.01 * true + 3.0 * own + 1e-4 * level)
+    assert scene.rays_cast == 0
+
+
+@pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
+def test_rows_with_shadows(make):
+    """Fragments of all kinds, lit and in shadow, inside and at borders."""
+    scene = make()
+    index = np.concatenate([
+        some(scene, 16, bordering=False, part="ground"),
+        some(scene, 12, bordering=False),
+        some(scene, 6, bordering=True),
+    ])  # fmt: skip
+    true, _ = reference.fragments(scene, index, MANY, 1e-3)
+    shown = by_rows(Operator(scene, GRID), index, MANY)
+    error = errors(shown, true)
+    print(f"rows: median {np.median(error):.4f}, worst {error.max():.4f}")
+    assert np.median(error) < 0.01
+    assert error.max() < 0.04
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
+def test_shadowed_fragments(make):
+    """Where a tenth of the light or more is hidden; by the images of a whole part as well."""
+    scene = make(56)
+    ground = scene.parts.index("ground")
+    span = scene.part_slice(ground)
+    candidates = np.flatnonzero(~scene.bordering)
+    own = candidates[scene.pixel_part[candidates] == ground]
+    rng = np.random.default_rng(4)
+    dark = own[shadowed(scene, own)]
+    assert len(dark) > 60
+    index = np.sort(rng.choice(dark, 40, replace=False))
+    true, _ = reference.fragments(scene, index, MANY, 1e-3)
+    operator = Operator(scene, GRID)
+    whole = diagonal(operator.part_images(ground, channels(MANY)))[index - span.start]
+    for kind, shown in (("rows", by_rows(operator, index, MANY)), ("part images", whole)):
+        error = errors(shown, true)
+        print(f"{kind}: median {np.median(error):.4f}, worst {error.max():.4f}")
+        assert np.median(error) < 0.01, kind
+        assert error.max() < 0.04, kind
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (2, 2), (2, 4), (4, 8), (16, 32)])
+def test_maps_of_a_few_texels(shape):
+    """Texels as large as the sky are cut into pieces without losing any of their light."""
+    scene = Scene(sphere(), noise(*shape, rotation=0.3), camera=Camera.orbit(20.0, 10.0), size=36,
+                  subsamples=1)  # fmt: skip
+    index = some(scene, 30)
+    true, _ = reference.fragments(scene, index, TABLES, 3e-4)
+    assert np.all(errors(by_rows(Operator(scene, GRID), index, TABLES), true) < 0.006)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 4), (4, 8), (8, 16), (16, 32), (64, 128)])
+def test_shadows_under_maps_of_a_few_texels(shape):
+    """The shadow of a large texel is soft, however few texels the map has."""
+    scene = ball_on_ground().changed(environment=noise(*shape))
+    place = scene.positions[scene.offsets[:-1]]
+    near = (np.hypot(place[:, 0], place[:, 2]) < 1.6) & ~scene.bordering
+    index = np.flatnonzero(near & (scene.pixel_part == 1))[::11]
+    assert len(index) > 20
+    true, _ = reference.fragments(scene, index, TABLES, 1e-3)
+    error = errors(by_rows(Operator(scene, GRID), index, TABLES), true)
+    print(f"{shape}: {np.round(error, 4)}")
+    assert np.median(error) < 0.01
+    assert error.max() < 0.03
+
+
+def test_lights_alone(small_sphere):
+    """Without a map a row is the table's own eval: exact."""
+    lights = [PointLight((2.0, 3.0, 2.0), (40.0, 30.0, 20.0)), DirectionalLight((0.0, 1.0, 0.3))]
+    dark = EnvironmentMap(np.zeros((4, 8, 3)))
+    scene = small_sphere.changed(environment=dark, lights=lights)
+    index = np.concatenate([some(scene, 40, bordering=False), some(scene, 10, bordering=True)])
+    true, _ = reference.fragments(scene, index, TABLES)
+    operator = Operator(scene, GRID)
+    # at borders some samples graze: what is next to nothing there need not agree to all digits
+    for shown in (by_rows(operator, index, TABLES), by_images(operator, index, TABLES)):
+        np.testing.assert_allclose(shown, true, rtol=1e-3, atol=1e-5 * true.max())
+
+
+def test_a_finer_resolution_errs_less(small_teapot):
+    scene = small_teapot.changed(shadows=False, lights=())
+    index = some(scene, 12, bordering=False)
+    true, _ = reference.fragments(scene, index, TABLES, 3e-4)
+    coarse, fine = (
+        errors(by_rows(Operator(scene, GRID, r), index, TABLES), true) for r in (0.5, 2)
+    )
+    assert np.mean(fine) < 0.3 * np.mean(coarse)
+
+
+# -- closed forms -----------------------------------------------------------------------------
+
+MAPS = ("forest", "lobby", "night", "studio", "sunset", "venice", "warehouse", "workshop")
+
+
+@pytest.mark.parametrize("light", ["sky", "turned", "uniform", "one texel", *MAPS])
+def test_a_lambert_surface_sees_the_irradiance(light, small_sphere, request):
+    environment = {
+        "sky": lambda: EnvironmentMap.sky(rows=64),
+        "turned": lambda: EnvironmentMap.sky(rows=32).rotated(2.0),
+        "uniform": lambda: EnvironmentMap.uniform((0.5, 1.0, 2.0), rows=128),
+        "one texel": lambda: one_texel(2, 13, 16, bright=1.0, rest=0.0),
+    }.get(light) or (
+        lambda: EnvironmentMap.read(
+            request.getfixturevalue("shared_data") / "envmaps" / f"{light}.exr"
+        )
+    )
+    scene = Scene(sphere(), environment(), camera=small_sphere.camera, size=48)
+    index = some(scene, 150, bordering=False)
+    shown = Operator(scene, GRID).images(index, GREY)[..., 0]
+    true = scene.environment.irradiance(scene.normals[scene.offsets[index]]) / math.pi
+    # the sum over texels is exact where the horizon cuts none
+    whole = true[:, 1] > 0.3 * true[:, 1].max() if light == "one texel" else slice(None)
+    assert np.abs(shown - true)[whole].mean() < 1e-3 * true[whole].mean()
+
+
+def test_a_uniform_map_is_the_albedo(small_sphere):
+    """Under radiance 1 from everywhere a pixel shows the directional albedo of its table."""
+    scene = small_sphere.changed(environment=EnvironmentMap.uniform(rows=32))
+    index = np.flatnonzero(~scene.bordering)
+    first = scene.offsets[index]
+    cos = np.sum(scene.normals[first] * scene.views[first], axis=-1)
+    seen = np.flatnonzero(cos > math.cos(math.radians(75.0)))[::20]
+    shown = by_rows(Operator(scene, GRID), index[seen], TABLES)
+    for i, table in enumerate(TABLES):
+        np.testing.assert_allclose(shown[:, i], table.albedo(np.arccos(cos[seen])), rtol=0.01)
+
+
+def test_no_light_is_black():
+    scene = ball_on_ground().changed(environment=EnvironmentMap(np.zeros((4, 8, 3))))
+    operator = Operator(scene, GRID)
+    index = some(scene, 20)
+    assert not operator.rows(index).any()
+    assert not operator.part_images(1, GREY).any()
+    assert not operator.mirror(index).any()
+
+
+# -- symmetries -------------------------------------------------------------------------------
+
+
+def test_rows_are_linear_in_the_light(small_sphere):
+    sky = EnvironmentMap.sky(rows=32, sun=None)
+    sun = EnvironmentMap.sky(rows=32, softboxes=False)
+    both = EnvironmentMap(sky.image + sun.image)
+    index = some(small_sphere, 12)
+
+    def radiance(environment):
+        scene = small_sphere.changed(environment=environment)
+        return by_rows(Operator(scene, GRID), index, TABLES)
+
+    np.testing.assert_allclose(radiance(sky.scaled(4.0)), 4.0 * radiance(sky), rtol=1e-5)
+    together, apart = radiance(both), radiance(sky) + radiance(sun)
+    assert np.abs(together - apart).mean() < 0.003 * together.mean()
+
+
+def test_brighter_light_casts_the_same_shadows():
+    scene = ball_on_ground()
+    brighter = scene.changed(environment=scene.environment.scaled(4.0))
+    index = some(scene, 20)
+    once, four = (by_rows(Operator(s, GRID), index, TABLES) for s in (scene, brighter))
+    np.testing.assert_allclose(four, 4.0 * once, rtol=1e-5)
+
+
+@pytest.mark.parametrize("ground", [False, True])
+def test_turning_everything_changes_nothing(ground):
+    """The map, the lights and the camera turned about +y together."""
+    shown = []
+    for turn in (0.0, 0.9):
+        c, s = math.cos(turn), math.sin(turn)
+        lights = [
+            DirectionalLight((0.6 * c + 0.8 * s, 1.0, 0.8 * c - 0.6 * s)),
+            PointLight((3.0 * s, 3.0, 3.0 * c), (9.0, 9.0, 9.0)),
+        ]
+        sky = EnvironmentMap.sky(rows=32).rotated(turn)
+        camera = Camera(math.degrees(turn), 15.0)
+        scene = Scene(sphere(), sky, lights, camera, size=32, ground=ground)
+        # a sample at an edge may fall to either side by rounding
+        index = np.flatnonzero(~scene.bordering)[::16]
+        shown.append((scene.pixels[index], by_rows(Operator(scene, GRID), index, TABLES)))
+    (pixels, first), (turned, second) = shown
+    np.testing.assert_array_equal(turned, pixels)
+    # rays that graze an edge decide by rounding too
+    off = np.abs(second - first).max(axis=(1, 2)) > 2e-3 * first.max(axis=(1, 2))
+    assert np.count_nonzero(off) <= (0.05 * len(off) if ground else 0)
+    assert np.all(errors(second, first) < (5e-3 if ground else 5e-4))
+
+
+@pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
+def test_how_fragments_are_grouped_does_not_show(make):
+    scene = make()
+    operator = Operator(scene, GRID)
+    index = some(scene, 40)
+    shuffled = np.random.default_rng(2).permutation(len(index))
+    whole = by_images(operator, index, TABLES)
+    level = whole.mean()
+    np.testing.assert_allclose(
+        by_images(operator, index[shuffled], TABLES), whole[shuffled], rtol=1e-5, atol=1e-6 * level
+    )
+    anew = Operator(scene, GRID)
+    parts = [by_images(anew, few, TABLES) for few in np.split(index, [1, 8, 31])]
+    np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-5, atol=1e-6 * level)
+    np.testing.assert_allclose(by_rows(anew, index, TABLES), whole, rtol=1e-3, atol=1e-5 * level)
+    operator._capacity = 40  # too small for any fragment: enlarged as often as need be
+    np.testing.assert_allclose(
+        by_images(operator, index, TABLES), whole, rtol=1e-5, atol=1e-6 * level
+    )
+    assert operator.images(index[:0], GREY).shape == (0, 3, 1)
+    assert operator.rows(index[:0]).shape == (0, 3, GRID.size)
+    assert operator.mirror(index[:0]).shape == (0, 3)
+
+
+# -- whole parts ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_images_of_whole_parts(shadows):
+    """Far images are interpolated over some pixels: that must not show."""
+    scene = teapot_on_ground().changed(shadows=shadows)
+    operator = Operator(scene, GRID)
+    tables = channels(MANY)
+    shown, true = [], []
+    for part in range(len(scene.parts)):
+        span = scene.part_slice(part)
+        index = np.arange(span.start, span.stop)[::3]
+        whole = operator.part_images(part, tables)
+        assert whole.shape == (span.stop - span.start, 3, tables.shape[1])
+        shown.append(diagonal(whole)[::3])
+        true.append(diagonal(operator.images(index, tables)))
+    error = errors(np.concatenate(shown), np.concatenate(true))
+    print(f"part images: median {np.median(error):.4f}, worst {error.max():.4f}")
+    assert np.median(error) < 0.005
+    assert error.max() < 0.015
+
+
+def test_a_part_that_is_not_seen():
+    scene = Scene(teapot(), camera=Camera.orbit(0.0, 90.0), size=12)
+    counts = np.bincount(scene.pixel_part, minlength=len(scene.parts))
+    unseen = int(np.flatnonzero(counts == 0)[0])
+    assert Operator(scene, GRID).part_images(unseen, GREY).shape == (0, 3, 1)
+
+
+def test_preparing_is_done_once_and_told():
+    scene = ball_on_ground().changed(environment=noise(16, 32))
+    operator = Operator(scene, GRID)
+    told = []
+    operator.prepare(1, lambda *news: told.append(news))
+    assert told[-1][1] == 1.0
+    cast = scene.rays_cast
+    assert cast > 0
+    count = np.count_nonzero(scene.pixel_part == 1)
+    # neighbours see nearly the same: far fewer than one ray for each direction and fragment
+    assert cast < 0.4 * count * len(operator._visibility.cut.share)
+    operator.prepare(1)
+    assert scene.rays_cast == cast
+
+
+def test_progress_can_cancel():
+    class StopError(Exception):
+        pass
+
+    def stop(stage, fraction):
+        raise StopError
+
+    with pytest.raises(StopError):
+        Operator(ball_on_ground(), GRID).part_images(0, GREY, stop)
+    with pytest.raises(StopError):
+        Operator(ball_on_ground(), GRID).prepare(1, stop)
+
+
+# -- shadows ----------------------------------------------------------------------------------
+
+
+def lit(shown, cos):
+    """Whether fragments get the light whose full irradiance is proportional to `cos`."""
+    full = np.max(shown / cos)
+    share = shown / (full * cos)
+    assert np.all((share < 0.05) | (share > 0.95)), "half a shadow"
+    return share > 0.5
+
+
+@pytest.mark.parametrize("shape", [sphere, teapot])
+@pytest.mark.parametrize("rows", [32, 128])
+def test_a_small_sun_casts_a_shadow_sharp_to_the_pixel(shape, rows):
+    row, column = int(0.28 * rows), int(0.33 * 2 * rows)
+    light = one_texel(row, column, rows)
+    camera = Camera.orbit(20.0, 30.0)
+    scene = Scene(shape(), light, camera=camera, size=64, ground=True)
+    ground = scene.parts.index("ground")
+    span = scene.part_slice(ground)
+    index = np.flatnonzero((scene.pixel_part == ground) & ~scene.bordering)
+    toward = texel_moments(light)[row, column]
+    toward /= np.linalg.norm(toward)  # the centre of its light
+    sample = scene.offsets[index]
+    free = scene.visible(sample, np.broadcast_to(toward, (len(sample), 3)))
+    assert 0.05 < np.mean(~free) < 0.6
+    operator = Operator(scene, GRID)
+    whole = operator.part_images(ground, GREY)[index - span.start, 1, 0]
+    np.testing.assert_array_equal(lit(whole, toward[1]), free)
+    alone = operator.images(index, GREY)[:, 1, 0]
+    np.testing.assert_array_equal(lit(alone, toward[1]), free)
+    rows_of = operator.rows(index[::7])[:, 1].sum(axis=-1)
+    np.testing.assert_array_equal(lit(rows_of, toward[1]), free[::7])
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        DirectionalLight((0.8, 1.0, 0.3), (2.0, 2.0, 2.0)),
+        PointLight((2.0, 2.5, 1.0), (9.0, 9.0, 9.0)),
+    ],
+    ids=["directional", "point"],
+)
+def test_lights_cast_the_shadow_of_a_ball(light):
+    """In closed form: what of the ground the ball hides from a light."""
+    dark = EnvironmentMap(np.zeros((4, 8, 3)))
+    scene = Scene(sphere(), dark, [light], Camera.orbit(20.0, 30.0), size=64, ground=True)
+    index = np.flatnonzero((scene.pixel_part == 1) & ~scene.bordering)
+    points = scene.positions[scene.offsets[index]]
+    toward, irradiance = light.arriving(points)
+    along = np.sum(-points * toward, axis=-1)  # to the point next to the ball's centre
+    apart = np.linalg.norm(points + along[:, None] * toward, axis=-1)
+    free = (along < 0.0) | (apart > 1.0)
+    sure = np.abs(apart - 1.0) > 1e-6
+    assert 0.05 < np.mean(~free) < 0.6
+    operator = Operator(scene, GRID)
+    full = irradiance[:, 1] * toward[:, 1] / math.pi
+    expected = np.where(free, full, 0.0)[sure]
+    for shown in (
+        operator.images(index, GREY)[:, 1, 0],
+        operator.rows(index)[:, 1].sum(axis=-1) / math.pi,
+        operator.part_images(1, GREY)[index - scene.part_slice(1).start, 1, 0],
+    ):
+        np.testing.assert_allclose(shown[sure], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_shadow_of_a_ball_under_a_grey_sky_is_soft():
+    """In closed form: under a uniform sky the ball takes its share of the irradiance."""
+    scene = Scene(sphere(), EnvironmentMap.uniform(rows=128), camera=Camera.orbit(0.0, 40.0),
+                  size=64, ground=True)  # fmt: skip
+    index = some(scene, 150, bordering=False, part="ground")
+    points = scene.positions[scene.offsets[index]]
+    # a ball of angular radius a, wholly above the horizon, hides sin(a)^2 cos(angle to the normal)
+    away = np.linalg.norm(points, axis=-1)
+    whole = points[:, 1] < -0.999
+    hidden = (1.0 / away) ** 2 * (1.0 / away)
+    shown = Operator(scene, GRID).images(index, GREY)[:, 1, 0]
+    error = np.abs(shown - (1.0 - hidden))
+    print(f"soft shadow: mean error {error[whole].mean():.5f}, worst {error[whole].max():.4f}")
+    assert whole.all()
+    assert hidden.max() > 0.55
+    assert error.mean() < 0.004
+    assert error.max() < 0.02
+
+
+def test_a_convex_shape_alone_casts_no_rays(small_sphere):
+    scene = small_sphere.changed(shadows=True)
+    operator = Operator(scene, GRID)
+    index = some(scene, 20)
+    operator.rows(index)
+    operator.part_images(0, GREY)
+    operator.mirror(index)
+    assert scene.rays_cast == 0
+    on_ground = ball_on_ground().changed(shadows=True)
+    operator = Operator(on_ground, GRID)
+    operator.part_images(0, GREY)
+    operator.mirror(some(on_ground, 20, part="sphere"))
+    assert on_ground.rays_cast == 0
+    operator.part_images(1, GREY)
+    assert on_ground.rays_cast > 0
+
+
+def test_a_perfect_mirror_shows_what_is_not_hidden():
+    scene = teapot_on_ground()
+    shown = Operator(scene, GRID).mirror(np.arange(len(scene.pixels)))
+    sample, owner, share = scene.samples(np.arange(len(scene.pixels)))
+    toward = reflect(scene.views, scene.normals)
+    seen = scene.environment.radiance(toward) * share[:, None]
+    free = scene.visible(sample, toward)
+    expected = np.zeros_like(shown)
+    np.add.at(expected, owner, np.where(free[:, None], seen, 0.0))
+    np.testing.assert_allclose(shown, expected, rtol=1e-5)
+    everything = Operator(scene.changed(shadows=False), GRID).mirror(np.arange(len(scene.pixels)))
+    assert np.all(shown <= everything * (1.0 + 1e-6))
+    assert np.mean(shown.max(axis=-1) < 0.5 * everything.max(axis=-1)) > 0.02
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        EnvironmentMap.sky(rows=64),
+        one_texel(5, 20, 32),
+        noise(4, 8),
+        EnvironmentMap.uniform(rows=1),
+        EnvironmentMap(np.eye(16)[:, :, None] * np.ones(3)),
+        EnvironmentMap(np.zeros((4, 8, 3))),
+    ],
+    ids=["sky", "one texel", "coarse", "one row", "diagonal", "dark"],
+)
+@pytest.mark.parametrize(("spacing", "share"), [(0.1, 1 / 300), (0.4, 0.05)])
+def test_visibility_cut(environment, spacing, share):
+    tree = LightTree.build(environment)
+    cut = VisibilityCut.build(tree, spacing, share)
+    count = len(cut.share)
+    assert cut.directions.shape == (count, 3)
+    np.testing.assert_allclose(np.linalg.norm(cut.directions, axis=-1), 1.0, atol=1e-6)
+    flux = np.linalg.norm(tree.moment.sum(axis=1, dtype=np.float64), axis=-1)
+    if environment.image.any():
+        # light of one node comes from several directions, which cancels by a little
+        assert 1.0 - spacing**2 < cut.share.sum() < 1.0 + 1e-5
+    else:
+        assert cut.share.sum() == 0.0
+    # ranges nest: the children of a node share its range out, or have all of it below the cut
+    assert (cut.first[0], cut.last[0]) == (0, count)
+    reached = np.zeros(len(flux), bool)
+    reached[0] = True
+    owners = np.zeros(count, int)
+    for i in range(len(flux)):  # a node's children come after it
+        if not reached[i]:
+            continue
+        first, last = int(cut.first[i]), int(cut.last[i])
+        assert last > first
+        children = [c for c in tree.child[i] if c >= 0]
+        reached[children] = True
+        if last - first > 1:
+            ranges = sorted((int(cut.first[c]), int(cut.last[c])) for c in children)
+            assert ranges[0][0] == first
+            assert ranges[-1][1] == last
+            assert len(ranges) == 1 or ranges[0][1] == ranges[1][0]
+        else:
+            for c in children:
+                assert (cut.first[c], cut.last[c]) == (first, last)
+    # every texel with light belongs to one node of the cut, which stands for its direction
+    box = tree.rectangle
+    texel = (box[:, 1] - box[:, 0] == 1) & (box[:, 3] - box[:, 2] == 1)
+    leaves = np.flatnonzero(texel & reached)
+    if environment.image.any():
+        assert len(leaves) == np.count_nonzero(environment.image.any(axis=-1))
+    assert np.all(cut.last[leaves] - cut.first[leaves] == 1)
+    np.add.at(owners, cut.first[leaves], 1)
+    if environment.image.any():
+        assert np.all(owners > 0)
+        several = owners[cut.first[leaves]] > 1
+        angle = np.linalg.norm(tree.direction[leaves] - cut.directions[cut.first[leaves]], axis=-1)
+        assert np.all(angle[several] < 2.0 * spacing)
+        assert np.all(angle[~several] < 1e-6)
+        # only single texels are brighter than asked for
+        assert np.all((cut.share <= 1.001 * share) | (owners == 1))
+    assert cut.neighbours.shape == (count, 6)
+    assert cut.neighbours.min() >= 0
+    assert cut.neighbours.max() < count
+    if count > 6:
+        assert np.all(cut.neighbours != np.arange(count)[:, None])
+
+
+# -- what is refused --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, math.nan, math.inf])
+def test_bad_resolutions(resolution, small_sphere):
+    with pytest.raises(ValueError, match="resolution"):
+        Operator(small_sphere, GRID, resolution)
+
+
+def test_bad_grids(small_sphere):
+    with pytest.raises(ValueError, match="folded"):
+        Operator(small_sphere, HalfDiffGrid(9, 9, 9, "merl"))
+
+
+def test_a_light_tree_at_hand_is_used(small_sphere):
+    tree = LightTree.build(small_sphere.environment)
+    index = some(small_sphere, 5)
+    operator = Operator(small_sphere, GRID, tree=tree)
+    assert operator.tree is tree
+    np.testing.assert_array_equal(operator.rows(index), Operator(small_sphere, GRID).rows(index))
