@@ -92,7 +92,7 @@ _CACHE_FORMAT = 1
 _FIRST_MATERIAL = "white-plastic"
 _FIRST_GROUND = "concrete"
 _TICK = 0.2  # seconds between two looks at how far a preparation has come
-_FAREWELL = 5.0  # seconds that the interpreter's end waits for a cancelled preparation
+_FAREWELL = 20.0  # seconds that the interpreter's end waits for a cancelled preparation
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +116,14 @@ class Material:
 
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
         """f_r (n, 3) at `cells` (n,) of the embedding's grid; at all of them if left out."""
-        if self.table is None:
+        if self.table is not None:
+            whole = self.table
+        elif cells is None or 2 * len(cells) > embedding.grid_.size:
+            # the energy check reads most of the grid: of many cells, all come as fast
+            whole = embedding.decode_values(self.z, self.offset)
+        else:
             return embedding.decode_values(self.z, self.offset, cells)
-        return self.table if cells is None else self.table.take(cells, axis=0)
+        return whole if cells is None else whole.take(cells, axis=0)
 
 
 @dataclass(frozen=True)
@@ -1158,8 +1163,7 @@ class EditSession:
             return {}
         frames = [one.frame for one in view.shown]
         changed = canvas.changed
-        z = self._materials[scene.parts[0]].z
-        decode = self.embedding.decode_values
+        plain = replace(self._materials[scene.parts[0]], table=None, offset=None)
         drawn = [scene.pixels[scene.part_slice(i)] for i in changed]
         still = [i for i in range(len(scene.parts)) if i not in changed]
         return {
@@ -1174,8 +1178,10 @@ class EditSession:
             "cells": {
                 "seen": len(transport.cells),
                 "of": self.embedding.grid_.size,
-                "seconds": _timed(lambda: decode(z, None, transport.cells), self.device),
-                "seconds_for_all": _timed(lambda: decode(z), self.device),
+                "seconds": _timed(
+                    lambda: plain.values(self.embedding, transport.cells), self.device
+                ),
+                "seconds_for_all": _timed(lambda: plain.values(self.embedding), self.device),
             },
             "channels": {"computed": 1 if transport.grey else 3, "of": 3},
             "parts_not_edited": {
@@ -1429,6 +1435,7 @@ def _prepare(
                 return transport, True
     report("tables", 0.0)
     training = _training(library, seed)
+    report("tables", 0.0)
     transport = Transport(scene, grid, training, rank, resolution, seed, device, report)
     if cache is not None and key is not None:
         cache.write_behind(key, transport.arrays())

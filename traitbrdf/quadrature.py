@@ -52,7 +52,7 @@ _OUTLINE = 0.03
 """theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
 _LEVELS = (4, 2)
 """Spacing in pixels of the lattices on which far images are computed."""
-_CUT = (0.1, 1 / 300)
+_CUT = (0.09, 1 / 500)
 """Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
 _BEND = (0.006, 0.12)
 """Most that a normal departs from its cell's corners': from their mean, and from any."""
@@ -375,7 +375,7 @@ class Operator:
         unknown = np.unique(index[casts & (visibility.row_of[index] < 0)])
         if len(unknown):
             around = np.full((len(unknown), 4), -1, np.int32)
-            for part, plan in self._plans.items():
+            for part, plan in list(self._plans.items()):
                 span = self.scene.part_slice(part)
                 mine = (unknown >= span.start) & (unknown < span.stop)
                 around[mine] = plan.mask_rows[unknown[mine] - span.start]

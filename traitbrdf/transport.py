@@ -57,23 +57,34 @@ Int64 = NDArray[np.int64]
 
 
 @dataclass
-class _PartBasis:
-    """One part's compressed operator; C is 3, or 1 where all light is grey."""
+class _Basis:
+    """The compressed operator of a group of parts; C is 3, or 1 where all light is grey."""
 
-    pixels: torch.Tensor  # (P,) flat pixel index of each fragment, each at most once
+    parts: range
     basis: torch.Tensor  # Q^T (C, r, P): this way round a product with a vector is fastest
-    cells: torch.Tensor  # (n,) the cells of the grid that the part sees
-    place: torch.Tensor  # (n,) where they are among `Transport.cells`
-    projection: torch.Tensor  # C (C, r, n)
-    probe_rows: torch.Tensor  # (C, m, n)
-    probe_basis: torch.Tensor  # (C, m, r)
-    probes: torch.Tensor  # (m,) which fragments of the part they are
+    cells: torch.Tensor  # (n,) the cells of the grid that the group sees
+    rows: torch.Tensor  # (C, r + m, n): the projection, and the probes' exact rows below it
+    place: torch.Tensor | None = None  # (n,) where the cells are among the scene's; None: all
+
+    @property
+    def rank(self) -> int:
+        return self.basis.shape[1]
+
+    def at_cells(self, table: torch.Tensor) -> torch.Tensor:
+        """(3, n) of a table (len(Transport.cells), 3)."""
+        return (table if self.place is None else table[self.place]).T.contiguous()
+
+
+@dataclass
+class _Part:
+    """One part's share of its group's basis."""
+
+    group: int
+    span: slice  # of the group's fragments
+    pixels: torch.Tensor  # (P,) flat pixel index of each fragment, each at most once
     mirror: torch.Tensor  # (P, 3) what a perfect mirror shows
-
-
-_STORED = (
-    "pixels", "basis", "cells", "projection", "probe_rows", "probe_basis", "probes", "mirror"
-)  # fmt: skip
+    probes: torch.Tensor  # (C, m) fragments of the part that keep exact rows, for each colour
+    exact: slice  # where these rows are among the group's
 
 
 @dataclass(frozen=True)
@@ -171,13 +182,13 @@ class Transport:
     progress : called with (stage, fraction); may raise to cancel
     """
 
-    TRAINING_ROWS = 128
-    """Fragments of a part (S) on which the training tables are compared."""
-    FIT_FACTOR = 5
+    TRAINING_ROWS = 320
+    """Fragments of a group (S) on which the training tables are compared."""
+    FIT_FACTOR = 6
     """Rows of the least-squares fit for each basis image."""
-    PROBES = 48
-    """Fragments of a part that are kept exact, to measure errors."""
-    ENOUGH = 1e-4
+    PROBES = 20
+    """Fragments of a part and colour that are kept exact, to measure errors."""
+    ENOUGH = 1e-6
     """Basis images that carry less of the training images than this are left out."""
 
     def __init__(
@@ -204,11 +215,7 @@ class Transport:
         rng = np.random.default_rng(seed)
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
-        total = max(len(scene.pixels), 1)
-        sizes = [len(range(*scene.part_slice(p).indices(total))) for p in range(len(scene.parts))]
-        shown = [part for part, size in enumerate(sizes) if size]
-        self.parts += [None] * len(sizes)
-        # the next part's rays are cast while this one is shaded
+        # the next part's rays are cast while others are shaded
         cancelled = threading.Event()
 
         def cast(part: int) -> None:
@@ -220,22 +227,28 @@ class Transport:
 
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             try:
-                waiting = [pool.submit(cast, part) for part in shown[:1]]
-                done = 0
-                for k, part in enumerate(shown):
-                    waiting[k].result()
-                    waiting += [pool.submit(cast, other) for other in shown[k + 1 : k + 2]]
-
-                    def told(
-                        stage: str, fraction: float, part: int = part, done: int = done
-                    ) -> None:
-                        report(stage, (done + fraction * sizes[part]) / total)
-
-                    self.parts[part] = self._compress(part, tables, importance, rng, told)
-                    done += sizes[part]
+                casting = {
+                    part: pool.submit(cast, part) for group in self._groups() for part in group
+                }
+                for group in self._groups():
+                    self.bases.append(
+                        self._compress(group, tables, importance, rng, casting, report)
+                    )
             finally:
                 cancelled.set()
         self._join_cells()
+
+    def _groups(self) -> list[range]:
+        """Parts that share a basis: those of the shape, which are often made of one material and
+        mostly look alike; and the ground, which does not."""
+        count = len(self.scene.shape.parts)
+        groups = [range(count), range(count, len(self.scene.parts))]
+        return [group for group in groups if len(self._fragments(group))]
+
+    def _fragments(self, group: range) -> range:
+        """The fragments of a group of parts."""
+        spans = [self.scene.part_slice(part) for part in group]
+        return range(spans[0].start, spans[-1].stop) if spans else range(0)
 
     def _begin(
         self,
@@ -252,7 +265,9 @@ class Transport:
         self.device = torch.device(device)
         self.grey = _is_grey(scene)
         """Whether all light is grey, so that one channel of the basis serves all three."""
-        self.parts: list[_PartBasis | None] = []
+        self.bases: list[_Basis] = []
+        self.parts: list[_Part | None] = [None] * len(scene.parts)
+        self._projected: tuple[Any, ...] = ()
         self._operator: Operator | None = None
         self._probe_operator: Operator | None = None
         backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
@@ -275,28 +290,70 @@ class Transport:
 
     def _compress(
         self,
-        part: int,
+        group: range,
         tables: torch.Tensor,
         importance: torch.Tensor,
         rng: np.random.Generator,
+        casting: Mapping[int, concurrent.futures.Future[None]],
         report: Progress,
-    ) -> _PartBasis:
-        operator = self.operator
-        span = self.scene.part_slice(part)
-        fragments = np.arange(span.start, span.stop)
-        operator.prepare(part, report)
-        probes = np.sort(rng.permutation(fragments)[: self.PROBES])
-        subset = np.sort(rng.permutation(fragments)[: self.TRAINING_ROWS])
-        mix, need = self._combinations(operator.rows(subset), tables, importance)
-        images = torch.from_numpy(operator.part_images(part, mix, report))
+    ) -> _Basis:
+        scene, operator = self.scene, self.operator
+        fragments = self._fragments(group)
         colours = 1 if self.grey else 3
-        whole = images.permute(1, 0, 2)[:colours].contiguous()
-        del images
-        damping = _damping(whole, len(subset))
-        basis = _sorted_basis(whole * damping, need, self.rank, self.ENOUGH)
+        subset = self._subset(group, rng)
+        mix, need = self._combinations(operator.rows(subset), tables, importance)
+        whole = torch.empty((colours, len(fragments), mix.shape[1]))
+        for part in group:
+            span = scene.part_slice(part)
+            casting[part].result()
+
+            def told(stage: str, fraction: float, span: slice = span) -> None:
+                done = span.start + fraction * (span.stop - span.start)
+                report(stage, done / max(len(scene.pixels), 1))
+
+            images = torch.from_numpy(operator.part_images(part, mix, told))
+            at = slice(span.start - fragments.start, span.stop - fragments.start)
+            whole[:, at] = images.permute(1, 0, 2)[:colours]
+        damping = _damping(whole, colours * len(subset))
+        basis = _sorted_basis(whole.mul_(damping), need, self.rank, self.ENOUGH)
         del whole
-        exact = self._exact.rows(probes)[:, :colours]
-        return self._assemble(part, basis, damping, probes, exact, rng)
+        exact: list[Float32] = []
+        for part in group:
+            span = scene.part_slice(part)
+            size = span.stop - span.start
+            if size == 0:
+                continue
+            count = min(self.PROBES, size)
+            probes = np.stack([np.sort(rng.permutation(size)[:count]) for _ in range(colours)])
+            known = sum(len(rows[0]) for rows in exact)
+            exact.append(self._probe_rows(probes + span.start))
+            mirror = operator.mirror(np.arange(span.start, span.stop))
+            self.parts[part] = _Part(
+                len(self.bases),
+                slice(span.start - fragments.start, span.stop - fragments.start),
+                torch.from_numpy(scene.pixels[span]).to(self.device),
+                torch.from_numpy(mirror).to(self.device),
+                torch.from_numpy(probes).to(self.device),
+                slice(known, known + count),
+            )
+        return self._assemble(group, basis, damping, np.concatenate(exact, axis=1), rng)
+
+    def _subset(self, group: range, rng: np.random.Generator) -> Int64:
+        """S: fragments of all parts, of small ones more than their share."""
+        spans = [self.scene.part_slice(part) for part in group]
+        sizes = np.array([span.stop - span.start for span in spans])
+        share = np.sqrt(sizes) / np.sqrt(sizes).sum()
+        chosen = [
+            span.start + rng.permutation(size)[: math.ceil(self.TRAINING_ROWS * part)]
+            for span, size, part in zip(spans, sizes, share, strict=True)
+        ]
+        return np.sort(np.concatenate(chosen))
+
+    def _probe_rows(self, probes: Int64) -> Float32:
+        """(C, m, cells) exact rows of fragments (C, m), each of one colour."""
+        distinct, where = np.unique(probes, return_inverse=True)
+        rows = self._exact.rows(distinct)
+        return np.stack([rows[at, c] for c, at in enumerate(where.reshape(probes.shape))])
 
     def _combinations(
         self, rows: Float32, tables: torch.Tensor, importance: torch.Tensor
@@ -315,7 +372,7 @@ class Transport:
         # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
         squares, u = _eigh(images @ images.T)
         count = min(self.rank if self.grey else self.rank + self.rank // 4, len(squares))
-        enough = squares.flip(0) > (0.3 * self.ENOUGH) ** 2 * squares[-1]
+        enough = squares.flip(0) > (0.1 * self.ENOUGH) ** 2 * squares[-1]
         count = max(1, min(count, int(enough.sum())))
         squares, u = squares.flip(0)[:count], u.flip(1)[:, :count]
         keep = squares > 1e-13 * squares[0].clamp_min(1e-30)
@@ -326,20 +383,18 @@ class Transport:
 
     def _assemble(
         self,
-        part: int,
+        group: range,
         basis: torch.Tensor,
         damping: torch.Tensor,
-        probes: Int64,
         exact: Float32,
         rng: np.random.Generator,
-    ) -> _PartBasis:
-        """The part's C by weighted least squares, and everything a frame reads."""
-        scene, colours = self.scene, len(basis)
-        span = scene.part_slice(part)
-        chosen, importance = self._fit_rows(basis, span.stop - span.start, rng)
-        rows = torch.from_numpy(self.operator.rows(chosen + span.start)[:, :colours])
-        seen = (rows != 0.0).any(dim=0).any(dim=0)
-        seen |= torch.from_numpy((exact != 0.0).any(axis=(0, 1)))
+    ) -> _Basis:
+        """The group's C by weighted least squares, and everything a frame reads."""
+        fragments, colours = self._fragments(group), len(basis)
+        chosen, importance = self._fit_rows(basis, len(fragments), rng)
+        rows = torch.from_numpy(self.operator.rows(chosen + fragments.start)[:, :colours])
+        probes = torch.from_numpy(exact)
+        seen = (rows != 0.0).any(dim=0).any(dim=0) | (probes != 0.0).any(dim=0).any(dim=0)
         cells = torch.nonzero(seen)[:, 0]
         weight = torch.from_numpy(importance)[:, None]
         at = torch.from_numpy(chosen)
@@ -350,23 +405,12 @@ class Transport:
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
         solve = (inverse @ sampled.transpose(1, 2) * damped).float()
-        shown = basis / damping
-        probe = torch.from_numpy(probes - span.start)
-        move = self.device
-        return _PartBasis(
-            pixels=torch.from_numpy(scene.pixels[span]).to(move),
-            basis=shown.transpose(1, 2).contiguous().to(move),
-            cells=cells.to(move),
-            place=cells.to(move),
-            projection=torch.bmm(solve, rows[:, :, cells].permute(1, 0, 2)).to(move),
-            probe_rows=(
-                torch.from_numpy(exact)[:, :, cells].permute(1, 0, 2).contiguous().to(move)
-            ),
-            probe_basis=shown[:, probe].contiguous().to(move),
-            probes=probe.to(move),
-            mirror=torch.from_numpy(self.operator.mirror(np.arange(span.start, span.stop))).to(
-                move
-            ),
+        projection = torch.bmm(solve, rows[:, :, cells].permute(1, 0, 2))
+        return _Basis(
+            parts=group,
+            basis=(basis / damping).transpose(1, 2).contiguous().to(self.device),
+            cells=cells.to(self.device),
+            rows=torch.cat([projection, probes[:, :, cells]], dim=1).to(self.device),
         )
 
     def _fit_rows(
@@ -388,15 +432,20 @@ class Transport:
     def _join_cells(self) -> None:
         """Gather the cells that any part sees: the others are neither decoded nor stored."""
         seen = torch.zeros(self.grid.size, dtype=torch.bool, device=self.device)
-        for basis in self.parts:
-            if basis is not None:
-                seen[basis.cells] = True
+        for basis in self.bases:
+            seen[basis.cells] = True
         self.cells = torch.nonzero(seen)[:, 0].cpu().numpy()
         """(n,) flat indices of the table cells that the scene can see."""
         place = torch.cumsum(seen, dim=0) - 1
-        for basis in self.parts:
-            if basis is not None:
-                basis.place = place[basis.cells]
+        for basis in self.bases:
+            basis.place = place[basis.cells]
+            if len(basis.cells) > 0.8 * len(self.cells):
+                # no look-up then, at the price of some zeros
+                wide = torch.zeros((*basis.rows.shape[:2], len(self.cells)), device=self.device)
+                wide[:, :, basis.place] = basis.rows
+                basis.rows, basis.place = wide, None
+                basis.cells = torch.nonzero(seen)[:, 0]
+        self._projected = ()
 
     def train(self, part: int, radiance: torch.Tensor) -> None:
         """Take an image into a part's basis, so that tables like its own are shown by it.
@@ -404,28 +453,31 @@ class Transport:
         Parameters
         ----------
         part : index into ``scene.parts``
-        radiance : (P, 3) the part's fragments under some table, as `shade_exactly` has them
+        radiance : (P, 3) the part's fragments under some table, without a mirror, as
+            `shade_exactly` has them
         """
-        known = self.parts[part]
-        if known is None:
-            return
         span = self.scene.part_slice(part)
         if radiance.shape != (span.stop - span.start, 3):
             raise ValueError(
                 f"radiance: expected ({span.stop - span.start}, 3), got {tuple(radiance.shape)}"
             )
+        mine = self.parts[part]
+        if mine is None:
+            return
+        known = self.bases[mine.group]
         colours = len(known.basis)
         fresh = (radiance.T if colours == 3 else radiance.T.mean(dim=0, keepdim=True)).cpu()
-        images = torch.cat([known.basis.cpu().transpose(1, 2), fresh[:, :, None]], dim=2)
+        images = torch.zeros((colours, known.basis.shape[2], known.rank + 1))
+        images[:, :, :-1] = known.basis.cpu().transpose(1, 2)
         # the image counts as much as a basis image does
-        images[:, :, -1] /= images[:, :, -1].norm(dim=1, keepdim=True).clamp_min(1e-30)
+        images[:, mine.span, -1] = fresh / fresh.norm(dim=1, keepdim=True).clamp_min(1e-30)
         damping = _damping(images, images.shape[1])
         basis = _orthonormal(images * damping)
-        probes = known.probes.cpu().numpy() + span.start
-        exact = np.zeros((len(probes), colours, self.grid.size), np.float32)
-        exact[:, :, known.cells.cpu().numpy()] = known.probe_rows.cpu().permute(1, 0, 2).numpy()
+        exact = np.zeros((*known.rows[:, known.rank :].shape[:2], self.grid.size), np.float32)
+        cells = known.cells.cpu().numpy()
+        exact[:, :, cells] = known.rows[:, known.rank :].cpu().numpy()
         rng = np.random.default_rng(basis.shape[-1])
-        self.parts[part] = self._assemble(part, basis, damping, probes, exact, rng)
+        self.bases[mine.group] = self._assemble(known.parts, basis, damping, exact, rng)
         self._join_cells()
 
     # -- files ----------------------------------------------------------------------------------
@@ -436,9 +488,12 @@ class Transport:
             "rank": np.array(self.rank),
             "resolution": np.array(self.resolution),
         }
+        for i, basis in enumerate(self.bases):
+            for name in ("basis", "cells", "rows"):
+                known[f"{name}_{i}"] = getattr(basis, name).cpu().numpy()
         for i, part in enumerate(self.parts):
             if part is not None:
-                for name in _STORED:
+                for name in ("pixels", "mirror", "probes"):
                     known[f"{name}_{i}"] = getattr(part, name).cpu().numpy()
         return known
 
@@ -463,52 +518,60 @@ class Transport:
             raise ValueError("arrays: expected a rank and a resolution")
         self._begin(scene, grid, int(rank), float(resolution), device)
         colours = 1 if self.grey else 3
-        for i in range(len(scene.parts)):
-            span = scene.part_slice(i)
-            size = span.stop - span.start
-            if size == 0:
-                self.parts.append(None)
-                continue
-            part = {name: np.asarray(arrays.get(f"{name}_{i}")) for name in _STORED}
-            (r, n, m) = (
-                part["basis"].shape[1] if part["basis"].ndim == 3 else -1,
-                len(part["cells"]) if part["cells"].ndim == 1 else -1,
-                len(part["probes"]) if part["probes"].ndim == 1 else -1,
+
+        def taken(name: str, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
+            """An array of a shape, -1 for any size."""
+            value = np.asarray(arrays.get(name))
+            fits = len(value.shape) == len(shape) and all(
+                want in (-1, got) for want, got in zip(shape, value.shape, strict=False)
             )
-            shapes = {
-                "pixels": (size,), "basis": (colours, r, size), "cells": (n,),
-                "projection": (colours, r, n), "probe_rows": (colours, m, n),
-                "probe_basis": (colours, m, r), "probes": (m,), "mirror": (size, 3),
-            }  # fmt: skip
-            for name, shape in shapes.items():
-                value = part[name]
-                kind = "i" if name in ("pixels", "cells", "probes") else "f"
-                if value.shape != shape or value.dtype.kind != kind:
-                    raise ValueError(
-                        f"arrays: expected {name}_{i} of shape {shape}, got {value.shape} "
-                        f"{value.dtype}"
-                    )
-            limits = {"cells": grid.size, "probes": size}
-            within = all(
-                part[name].size == 0 or (part[name].min() >= 0 and part[name].max() < limit)
-                for name, limit in limits.items()
+            if not fits or value.dtype.kind != kind:
+                raise ValueError(
+                    f"arrays: expected {name} of shape {shape}, got {value.shape} {value.dtype}"
+                )
+            return value
+
+        def indices(name: str, shape: tuple[int, ...], limit: int) -> NDArray[Any]:
+            value = taken(name, "i", shape)
+            if value.size and not (value.min() >= 0 and value.max() < limit):
+                raise ValueError(f"arrays: expected {name} from 0 to {limit - 1}")
+            return value
+
+        for g, group in enumerate(self._groups()):
+            fragments = self._fragments(group)
+            basis = taken(f"basis_{g}", "f", (colours, -1, len(fragments)))
+            cells = indices(f"cells_{g}", (-1,), grid.size)
+            known = 0
+            for i in group:
+                span = scene.part_slice(i)
+                size = span.stop - span.start
+                if size == 0:
+                    continue
+                pixels = taken(f"pixels_{i}", "i", (size,))
+                if not np.array_equal(pixels, scene.pixels[span]):
+                    raise ValueError("arrays: expected those of this scene, got other pixels")
+                probes = indices(f"probes_{i}", (colours, -1), size)
+                mirror = taken(f"mirror_{i}", "f", (size, 3))
+                self.parts[i] = _Part(
+                    g,
+                    slice(span.start - fragments.start, span.stop - fragments.start),
+                    torch.from_numpy(pixels).to(self.device),
+                    torch.from_numpy(mirror).to(self.device),
+                    torch.from_numpy(probes).to(self.device),
+                    slice(known, known + probes.shape[1]),
+                )
+                known += probes.shape[1]
+            rows = taken(f"rows_{g}", "f", (colours, basis.shape[1] + known, len(cells)))
+            self.bases.append(
+                _Basis(group, *(torch.from_numpy(a).to(self.device) for a in (basis, cells, rows)))
             )
-            if not within or not np.array_equal(part["pixels"], scene.pixels[span]):
-                raise ValueError("arrays: expected those of this scene, got other pixels or cells")
-            tensors = {name: torch.from_numpy(v).to(self.device) for name, v in part.items()}
-            self.parts.append(_PartBasis(**tensors, place=tensors["cells"]))
         self._join_cells()
         return self
 
     @property
     def bytes(self) -> int:
         """Size of everything that a frame reads."""
-        return sum(
-            t.numel() * t.element_size()
-            for p in self.parts
-            if p is not None
-            for t in (p.basis, p.projection, p.probe_rows, p.probe_basis)
-        )
+        return sum(t.numel() * t.element_size() for b in self.bases for t in (b.basis, b.rows))
 
     # -- frames ---------------------------------------------------------------------------------
 
@@ -524,8 +587,20 @@ class Transport:
         known = self.parts[part]
         if known is None:
             return torch.zeros((0, 3), device=self.device)
-        coefficients = _per_colour(known.projection, table[known.place].T)
-        return _per_colour(known.basis.transpose(1, 2), coefficients).T
+        basis = self.bases[known.group]
+        coefficients = _per_colour(basis.rows[:, : basis.rank], basis.at_cells(table))
+        return _per_colour(basis.basis[:, :, known.span].transpose(1, 2), coefficients).T
+
+    def _project(self, group: int, table: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The table at the group's cells (3, n) and its coefficients (3, r); the last is kept,
+        since parts of one material follow each other."""
+        key = (group, table._version)
+        if not (self._projected and self._projected[0] is table and self._projected[1] == key):
+            basis = self.bases[group]
+            columns = basis.at_cells(table)
+            coefficients = _per_colour(basis.rows[:, : basis.rank], columns)
+            self._projected = (table, key, columns, coefficients)
+        return self._projected[2], self._projected[3]
 
     def shade(
         self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
@@ -544,13 +619,15 @@ class Transport:
         if known is None:
             empty = torch.zeros((0, 3), device=self.device)
             return PartFrame(empty, 0.0, 0.0)
-        columns = table[known.place].T.contiguous()
-        coefficients = _per_colour(known.projection, columns)
-        exact = _per_colour(known.probe_rows, columns)
-        shown = _per_colour(known.probe_basis, coefficients).clamp_min(0.0)
-        deviation = float((shown - exact).abs().mean())
+        basis = self.bases[known.group]
+        columns, coefficients = self._project(known.group, table)
+        shown = _per_colour(basis.basis[:, :, known.span].transpose(1, 2), coefficients)
+        shown = shown.clamp_min_(0.0)
+        pixels = shown.T
+        exact = self._probed(known, columns)
+        found = torch.gather(shown, 1, known.probes.expand(3, -1))
+        deviation = float((found - exact).abs().mean())
         level = float(exact.mean())
-        pixels = _per_colour(known.basis.transpose(1, 2), coefficients).T.clamp_min(0.0)
         if mirror is not None and bool((mirror > 0.0).any()):
             pixels = pixels + mirror * known.mirror
         return PartFrame(pixels, deviation, level)
@@ -577,12 +654,18 @@ class Transport:
         known = self.parts[part]
         if known is None:
             return PartFrame(radiance, 0.0, 0.0)
-        columns = torch.from_numpy(table).to(self.device)[known.cells].T.contiguous()
-        exact = _per_colour(known.probe_rows, columns).T
-        shown = radiance[known.probes]
+        seen = torch.from_numpy(table[self.cells]).to(self.device)
+        exact = self._probed(known, self.bases[known.group].at_cells(seen))
+        found = torch.gather(radiance.T, 1, known.probes.expand(3, -1))
         if mirror is not None:
             radiance = radiance + mirror * known.mirror
-        return PartFrame(radiance, float((shown - exact).abs().mean()), float(exact.mean()))
+        return PartFrame(radiance, float((found - exact).abs().mean()), float(exact.mean()))
+
+    def _probed(self, part: _Part, columns: torch.Tensor) -> torch.Tensor:
+        """(3, m) exact radiance of a part's probes."""
+        basis = self.bases[part.group]
+        rows = slice(basis.rank + part.exact.start, basis.rank + part.exact.stop)
+        return _per_colour(basis.rows[:, rows], columns)
 
     def compose(self, frames: list[PartFrame]) -> torch.Tensor:
         """The frame (H, W, 3): the parts over the backdrop."""
