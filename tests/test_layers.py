@@ -14,7 +14,8 @@ FLOORS = (
     ("directions", "formats"),
     ("models", "brdf", "measured", "lights", "shapes"),
     ("embedding", "traits", "strokes", "scene"),
-    ("reference", "transport", "fitting"),
+    ("reference", "quadrature"),
+    ("transport", "fitting"),
     ("editing",),
     ("bench",),
     ("studio", "cli"),
@@ -28,6 +29,7 @@ HOMES = {
     "sklearn": {"embedding", "traits"},
     "embreex": {"shapes"},
     "trimesh": {"shapes"},
+    "numba": {"quadrature"},
 }
 """Where else's package may be imported."""
 

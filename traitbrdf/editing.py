@@ -76,7 +76,7 @@ TRUSTED = 0.7
 dozens of probes are a noisy measurement."""
 
 TRAINED_IMAGES = 8
-"""At most so many exact images are taken into the basis of a part."""
+"""At most so many exact images are taken into a basis."""
 
 DRAFT_SIZE = 128
 """Pixels along the longer side of a draft."""
@@ -998,7 +998,8 @@ class EditSession:
             mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
         frame = transport.shade(index, tables[material], mirror)
         tier: Literal["basis", "trained", "exact"] = "basis"
-        if view.trained.get(index):
+        part = transport.parts[index]
+        if part is not None and part.group in view.budget:
             tier = "trained"
         if frame.error > self._allowed(view, index):
             frame, tier = self._exactly(view, transport, index, material, mirror), "exact"
@@ -1024,22 +1025,22 @@ class EditSession:
     ) -> PartFrame:
         """A part without the basis; its image is taken into the basis for the edits to come."""
         values = material.values(self.embedding)
+        part = transport.parts[index]
         with _TURNS.urgent():
             frame = transport.shade_exactly(index, values)
             if frame.error > TRUSTED * EXACT_ABOVE:
                 view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
             allowed = self._allowed(view, index)
-            budget = view.budget.get(index, TRAINED_IMAGES)
+            budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)
             # where even exact frames miss the error asked for, the basis cannot meet it
-            if budget > 0 and frame.error <= allowed:
+            if part is not None and budget > 0 and frame.error <= allowed:
                 transport.train(index, frame.radiance)
                 table = torch.from_numpy(values[transport.cells]).to(self.device)
                 met = transport.shade(index, table).error <= allowed
                 view.trained[index] = view.trained.get(index, 0) + 1
                 # each image makes all frames slower: few of those that do not help
-                view.budget[index] = budget - (1 if met else TRAINED_IMAGES // 2)
+                view.budget[part.group] = budget - (1 if met else TRAINED_IMAGES // 2)
         view.exact_frames += 1
-        part = transport.parts[index]
         if mirror is None or part is None:
             return frame
         return replace(frame, radiance=frame.radiance + mirror * part.mirror)

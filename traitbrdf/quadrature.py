@@ -130,7 +130,10 @@ class Operator:
         self.grid = grid
         self.resolution = resolution
         environment = _divided(scene.environment)
-        self.tree = LightTree.build(environment) if tree is None else tree
+        rows, columns, _ = environment.image.shape
+        if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
+            tree = LightTree.build(environment)
+        self.tree = tree
         self._nodes = _pack(self.tree)
         self._image = environment.image
         scale = 1.0 / resolution
