@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="paint 'shiny' on the teapot's handle and see it")
     _add_scene(demo)
     demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder (%(default)s)")
+    demo.set_defaults(ground=2.0)
     demo.add_argument("--material", default=DEMO_MATERIAL, help="library name (%(default)s)")
     demo.set_defaults(run=_demo)
 
@@ -103,6 +104,13 @@ def _parser() -> argparse.ArgumentParser:
 def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a procedural sky")
     parser.add_argument("--shape", choices=("teapot", "sphere"), default="teapot")
+    parser.add_argument(
+        "--ground",
+        type=float,
+        default=0.0,
+        metavar="RADIUS",
+        help="of the disc that it stands on, in radii of the shape; 0 for none (%(default)s)",
+    )
     parser.add_argument("--size", type=_size, default=512, help="pixels (%(default)s)")
     parser.add_argument(
         "--camera", type=float, nargs=3, default=DEMO_CAMERA,
@@ -140,7 +148,8 @@ def _scene(given: argparse.Namespace) -> tb.Scene:
     if given.shape == "sphere" and tuple(given.camera) == DEMO_CAMERA:
         zoom = 1.0
     camera = tb.Camera.orbit(azimuth, elevation, zoom=zoom)
-    return tb.Scene(shape, environment, camera=camera, size=given.size)
+    ground = given.ground if given.ground != 0.0 else False
+    return tb.Scene(shape, environment, camera=camera, size=given.size, ground=ground)
 
 
 def _write(path: Path, image: NDArray[np.float32]) -> None:
@@ -202,7 +211,7 @@ def _demo(given: argparse.Namespace) -> int:
     session = _prepared(scene)
     clock = step("preparation", clock)
     print(f"light transport prepared ({seconds['preparation']:.1f} s)")
-    session.assign(scene.parts, given.material)
+    session.assign(scene.shape.parts, given.material)
     before = session.render()
     clock = step("first frame", clock)
     print(f"all parts made of {given.material} ({1e3 * seconds['first frame']:.1f} ms)")
@@ -219,7 +228,9 @@ def _demo(given: argparse.Namespace) -> int:
     clock = step("stroke", clock)
     after = session.render()
     step("frame after the stroke", clock)
-    outside = ~inside
+    # a border pixel belongs to all parts that it shows
+    outside = np.ones(inside.shape, bool)
+    outside.flat[scene.pixels[scene.part_slice(scene.parts.index(part))]] = False
     changed = int(np.count_nonzero((before != after).any(axis=-1) & outside))
     print(
         f"painted 'shiny' {DEMO_AMOUNT:+g} on "
@@ -271,7 +282,7 @@ def _paint(given: argparse.Namespace) -> int:
     scene = _scene(given)
     part = given.part or ("handle" if "handle" in scene.parts else scene.parts[0])
     session = tb.EditSession(scene)
-    session.assign(scene.parts, given.material)
+    session.assign(scene.shape.parts, given.material)
     before = session.scores(part)
     session.move(part, hold=tuple(given.hold), **dict(given.trait))
     after = session.scores(part)
@@ -292,7 +303,7 @@ def _render(given: argparse.Namespace) -> int:
     else:
         material = _material(given.material)
         session = tb.EditSession(_scene(given))
-        session.assign(session.scene.parts, material)
+        session.assign(session.scene.shape.parts, material)
     start = time.perf_counter()
     if given.reference:
         parts = session.scene.parts

@@ -185,10 +185,17 @@ class Operator:
 
     # -- whole parts ----------------------------------------------------------------------------
 
-    def part_images(self, part: int, tables: Float32, progress: Progress | None = None) -> Float32:
+    def part_images(
+        self,
+        part: int,
+        tables: Float32,
+        progress: Progress | None = None,
+        interpolate: bool = True,
+    ) -> Float32:
         """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
 
-        Far images are interpolated where that is safe: an order of magnitude faster than `images`.
+        Shadows are interpolated where rays agree, and far images where that is safe, unless
+        `interpolate` is False: an order of magnitude faster than `images`.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
@@ -197,6 +204,14 @@ class Operator:
         if len(index) == 0:
             return np.zeros((0, 3, tables.shape[1]), np.float32)
         plan = self._plan(part, report)
+        if not interpolate:
+            out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
+            self._shade(
+                out, index, plan.mask_rows, _ALL, tables,
+                lambda fraction: report("exact images", fraction),
+            )  # fmt: skip
+            self._add_lights(out, index, tables)
+            return out
         near = np.repeat(_near_window(self.grid), self.grid.shape[1] * self.grid.shape[2])
         wide = tables * (1.0 - near)[:, None]
         narrow = tables * near[:, None]
@@ -793,7 +808,7 @@ def _shadows_agree(
     if sharp is not None:
         nodes, own = sharp
         for k, node in enumerate(nodes):
-            bit = visibility.bits[:, node]
+            bit = np.append(visibility.bits[:, node], np.uint8(2))  # row -1: nothing is known
             # a corner below the light's horizon says nothing about its shadow
             same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
             agree &= same.all(axis=1)

@@ -301,7 +301,10 @@ class Transport:
         fragments = self._fragments(group)
         colours = 1 if self.grey else 3
         subset = self._subset(group, rng)
-        mix, need = self._combinations(operator.rows(subset), tables, importance)
+        # an operator of its own: what rays are cast must not depend on what other threads know
+        scout = Operator(scene, self.grid, self.resolution, operator.tree)
+        mix, need = self._combinations(scout.rows(subset), tables, importance)
+        del scout
         whole = torch.empty((colours, len(fragments), mix.shape[1]))
         for part in group:
             span = scene.part_slice(part)
@@ -649,7 +652,7 @@ class Transport:
         """
         if table.shape != (self.grid.size, 3):
             raise ValueError(f"table: expected ({self.grid.size}, 3), got {table.shape}")
-        images = self.operator.part_images(part, table, progress)
+        images = self.operator.part_images(part, table, progress, interpolate=False)
         radiance = torch.from_numpy(np.einsum("pcc->pc", images).copy()).to(self.device)
         known = self.parts[part]
         if known is None:
