@@ -121,7 +121,7 @@ def test_record_says_when_a_target_is_missed() -> None:
 
 
 def test_texel_sum_is_the_reference_for_a_rough_surface() -> None:
-    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=64), size=8)
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=64), size=8, subsamples=1)
     brdf = tb.default_library()["white-plaster"]
     index = np.arange(0, len(scene.pixels), 7)
     plain = bench.texel_sum(scene, index, brdf)

@@ -404,7 +404,7 @@ def lit(shown, cos):
 
 
 @pytest.mark.parametrize("shape", [sphere, teapot])
-@pytest.mark.parametrize("rows", [32, 128])
+@pytest.mark.parametrize("rows", [128, 256])
 def test_a_small_sun_casts_a_shadow_sharp_to_the_pixel(shape, rows):
     row, column = int(0.28 * rows), int(0.33 * 2 * rows)
     light = one_texel(row, column, rows)

@@ -194,11 +194,28 @@ def _take_brdfs(brdfs: Sequence[Reflectance]) -> None:
 
 def _reference_job(job: tuple[Scene, Int64, float]) -> tuple[Float64, Float64]:
     scene, index, tolerance = job
-    return reference.fragments(scene, index, _BRDFS, tolerance)
+    return _fragments(scene, index, _BRDFS, tolerance)
+
+
+def _fragments(
+    scene: Scene, index: Int64, brdfs: Sequence[Reflectance], tolerance: float
+) -> tuple[Float64, Float64]:
+    """`reference.fragments`, NaN where the tolerance is not reached."""
+    try:
+        return reference.fragments(scene, index, brdfs, tolerance)
+    except reference.IntegrationError:
+        if len(index) == 1:
+            unknown = np.full((1, len(brdfs), 3), np.nan)
+            return unknown, unknown
+    halves = [_fragments(scene, half, brdfs, tolerance) for half in np.array_split(index, 2)]
+    values, errors = (np.concatenate(each) for each in zip(*halves, strict=True))
+    return values, errors
 
 
 class Oracle:
     """`reference.fragments` for the same BRDFs again and again, on all cores.
+
+    Where it refuses (next to grazing views some lobes need too many cells) there is NaN.
 
     Parameters
     ----------
@@ -225,7 +242,7 @@ class Oracle:
     def __call__(self, scene: Scene, index: Int64) -> tuple[Float64, Float64]:
         """Radiance (m, B, 3) of fragments `index` (m,), and its own error."""
         if self.cores == 1 or len(index) < 32:
-            return reference.fragments(scene, index, self.brdfs, self.tolerance)
+            return _fragments(scene, index, self.brdfs, self.tolerance)
         if self._pool is None:
             self._pool = concurrent.futures.ProcessPoolExecutor(
                 self.cores,
@@ -234,7 +251,8 @@ class Oracle:
                 initargs=(self.brdfs,),
             )
         # every n-th, so that parts and borders are shared out
-        parts = [np.arange(k, len(index), 4 * self.cores) for k in range(4 * self.cores)]
+        jobs = max(4 * self.cores, len(index) // 16)
+        parts = [np.arange(k, len(index), jobs) for k in range(jobs)]
         done = list(
             self._pool.map(_reference_job, [(scene, index[p], self.tolerance) for p in parts])
         )
@@ -246,7 +264,10 @@ class Oracle:
 def reference_values(
     scene: Scene, index: Int64, brdfs: Sequence[Reflectance], tolerance: float
 ) -> tuple[Float64, Float64]:
-    """The oracle at fragments `index` (m,) for B BRDFs: (m, B, 3) and its own error; all cores."""
+    """The oracle at fragments `index` (m,) for B BRDFs: (m, B, 3) and its own error; all cores.
+
+    NaN where it refuses.
+    """
     with Oracle(brdfs, tolerance) as oracle:
         return oracle(scene, index)
 

@@ -129,7 +129,8 @@ class Operator:
         self.scene = scene
         self.grid = grid
         self.resolution = resolution
-        environment = _divided(scene.environment)
+        # a texel is lit or not as a whole
+        environment = _divided(scene.environment, 128 if any(scene.casts) else 16)
         rows, columns, _ = environment.image.shape
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
             tree = LightTree.build(environment)
@@ -529,6 +530,7 @@ class _Visibility:
         self.toward = turn_about_y(cut.directions, scene.environment.rotation)
         self.row_of = np.full(len(scene.pixels), -1, np.int32)
         self.rows = 0
+        self._sharp = cut.share > 0.02  # suns, that cast sharp shadows
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
         self._middle = middle
         self._bits = np.zeros((0, len(cut.share)), np.uint8)
@@ -558,7 +560,7 @@ class _Visibility:
         for i in range(0, len(index), 2048):
             some = slice(i, min(i + 2048, len(index)))
             bits = np.empty((some.stop - some.start, len(self.cut.share)), np.uint8)
-            _inherit(bits, normals[some], self.toward, self._bits, around[some], least)
+            _inherit(bits, normals[some], self.toward, self._bits, around[some], least, self._sharp)
             if verify:
                 inherited = bits[:, ::8].copy()
                 bits[:, ::8][inherited < 2] = 3
@@ -815,10 +817,10 @@ def _shadows_agree(
     return agree
 
 
-def _divided(environment: EnvironmentMap) -> EnvironmentMap:
-    """The same light with at least 16 rows: texels that are small angles."""
+def _divided(environment: EnvironmentMap, least: int) -> EnvironmentMap:
+    """The same light with at least so many rows: texels that are small angles."""
     rows, columns, _ = environment.image.shape
-    down, across = -(-16 // rows), -(-32 // columns)
+    down, across = -(-least // rows), -(-2 * least // columns)
     if down == across == 1:
         return environment
     image = environment.image.repeat(down, axis=0).repeat(across, axis=1)
@@ -893,7 +895,9 @@ def _cut_ranges(child: Any, split: Any) -> Any:
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
-def _inherit(bits: Any, normals: Any, toward: Any, known: Any, around: Any, least: Any) -> None:
+def _inherit(
+    bits: Any, normals: Any, toward: Any, known: Any, around: Any, least: Any, sharp: Any
+) -> None:
     """Bits that all rows around agree on, 2 below the horizon, 3 where a ray is needed."""
     for p in numba.prange(len(bits)):
         have = 0
@@ -910,7 +914,7 @@ def _inherit(bits: Any, normals: Any, toward: Any, known: Any, around: Any, leas
                 bits[p, d] = 2
                 continue
             value = 3
-            if have >= least:
+            if have >= least and not sharp[d]:
                 for k in range(4):
                     if around[p, k] >= 0:
                         b = known[around[p, k], d]
@@ -1148,7 +1152,8 @@ def _walk(
                         seen -= f32(1.0) / f32(rows)
         if in_texel:
             half, _ = _turned(f32(0.5) * (t1 - t0), f32(0.0), f32(1.0))
-            omega = f32(2.0) * st * half * (f1 - f0)
+            # the mean of its directions is shorter than one by half their variance
+            omega = f32(2.0) * st * half * (f1 - f0) * (f32(1.0) - variance)
             row, column = box[i, 0], box[i, 2]
             m0 = image[row, column, 0] * omega
             m1 = image[row, column, 1] * omega
