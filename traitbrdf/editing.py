@@ -44,6 +44,7 @@ from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.embedding import BRDFEmbedding, Library, default_library
 from traitbrdf.formats import FormatError, atomic_path, read_arrays, unknown_name, write_arrays
 from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, LightTree, PointLight
+from traitbrdf.quadrature import light_tree
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
@@ -227,7 +228,7 @@ class _LightTrees:
     def of(self, environment: EnvironmentMap) -> LightTree:
         with self._lock:
             if self._tree is None or self._image is not environment.image:
-                self._tree, self._image = LightTree.build(environment), environment.image
+                self._tree, self._image = light_tree(environment), environment.image
             return self._tree
 
 

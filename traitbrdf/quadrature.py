@@ -112,7 +112,7 @@ class Operator:
     grid : HalfDiffGrid of the "folded" layout
     resolution : float
         1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
-    tree : LightTree of the scene's map, from another operator under the same map
+    tree : what `light_tree` makes of the scene's map, if it is at hand
     """
 
     def __init__(
@@ -129,8 +129,7 @@ class Operator:
         self.scene = scene
         self.grid = grid
         self.resolution = resolution
-        # a texel is lit or not as a whole
-        environment = _divided(scene.environment, 128 if any(scene.casts) else 16)
+        environment = _divided(scene.environment)
         rows, columns, _ = environment.image.shape
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
             tree = LightTree.build(environment)
@@ -671,7 +670,9 @@ class _Plan:
             if casts is not None:
                 ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
             good = open_[ok]
-            corners[good] = np.where(found[ok] >= 0, found[ok], good[:, None])
+            # a missing corner weighs nothing: any other stands for it
+            some = np.take_along_axis(found, (found >= 0).argmax(axis=1)[:, None], axis=1)
+            corners[good] = np.where(found >= 0, found, some)[ok]
             weights[good] = weight[ok]
             around[open_] = np.where((found >= 0).sum(1)[:, None] >= 2, found, around[open_])
             open_ = open_[~ok]
@@ -692,6 +693,7 @@ class _Plan:
             # where nothing hides anything around, there is nothing to look up
             clear = np.where(mask_rows >= 0, free[mask_rows], True).all(axis=1) & single
             mask_rows[clear] = -1
+            mask_rows = -np.sort(-mask_rows, axis=1)  # the walk reads up to the first -1
         return cls(
             computed, index.reshape(corners.shape).astype(np.int32),
             weights.astype(np.float32), mask_rows,
@@ -817,10 +819,16 @@ def _shadows_agree(
     return agree
 
 
-def _divided(environment: EnvironmentMap, least: int) -> EnvironmentMap:
-    """The same light with at least so many rows: texels that are small angles."""
+def light_tree(environment: EnvironmentMap) -> LightTree:
+    """The tree that an `Operator` walks; build it once for several operators under one map."""
+    return LightTree.build(_divided(environment))
+
+
+def _divided(environment: EnvironmentMap) -> EnvironmentMap:
+    """The same light in texels of at most 1/256 of a half turn: each is hidden or not as a whole,
+    and small enough for series about its centre."""
     rows, columns, _ = environment.image.shape
-    down, across = -(-least // rows), -(-2 * least // columns)
+    down, across = -(-256 // rows), -(-512 // columns)
     if down == across == 1:
         return environment
     image = environment.image.repeat(down, axis=0).repeat(across, axis=1)
