@@ -81,6 +81,39 @@ def test_paint_writes_a_picture_and_a_design(
     np.testing.assert_array_equal(session.render(), read_image(again))
 
 
+def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a flag, with a radius, or none; it is a part of its own and saved with the design."""
+
+    def shown(*arguments: str) -> np.ndarray:
+        out = tmp_path / "x.exr"
+        common = ["--shape", "sphere", "--size", "24", "--camera", "20", "25", "1"]
+        assert main(["render", *common, *arguments, "--out", str(out)]) == 0
+        return read_image(out)
+
+    plain, flag, wide = shown(), shown("--ground"), shown("--ground", "5")
+    np.testing.assert_array_equal(shown("--ground", "0"), plain)
+    np.testing.assert_array_equal(shown("--ground", "2"), flag)
+    changed, further = ((other != plain).any(axis=-1) for other in (flag, wide))
+    assert 0.1 < changed.mean() < further.mean()
+    out, design = tmp_path / "x.png", tmp_path / "x.tbr"
+    assert main([
+        "paint", "--shape", "sphere", "--size", "24", "--ground", "--trait", "shiny=0.5",
+        "--out", str(out), "--save", str(design),
+    ]) == 0  # fmt: skip
+    assert "sphere: shiny" in capsys.readouterr().out
+    session = tb.EditSession.load(design)
+    assert session.scene.parts == ("sphere", "ground")
+    assert session.material("ground").name != session.material("sphere").name
+    assert "ground" in fails(capsys, "render", "--ground", "-1", "--size", "16", "--out", str(out))
+
+
+def test_the_demo_stands_on_the_ground(tmp_path: Path) -> None:
+    assert main(["demo", "--shape", "sphere", "--size", "32", "--out", str(tmp_path)]) == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert set(report["parts"]) == {"sphere", "ground"}
+    assert report["demo"]["changed_outside"] == 0
+
+
 def test_render_by_the_oracle_agrees(tmp_path: Path) -> None:
     fast, slow = tmp_path / "fast.exr", tmp_path / "slow.exr"
     common = ["render", "--shape", "sphere", "--size", "8", "--material", "red-rubber"]
@@ -101,20 +134,57 @@ def test_info(tmp_path: Path, shared_data: Path, capsys: pytest.CaptureFixture[s
     assert "albedo at" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("table", ["table error, median"]),
+        ("shadows", ["error in the shade, median", "a one-texel sun: lit or dark as a ray says"]),
+        pytest.param(
+            "transport",
+            ["transport error, 95th percentile", "tone-mapped PSNR, 5th percentile"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("families", ["left out: of these noticed"], marks=pytest.mark.slow),
+        pytest.param(
+            "edit",
+            ["edit of the whole object to frame, 64x64, median", "plain sum over texels, a frame"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "prepare",
+            ["preparation", "preparation from the cache on disk",
+             "first image after a change of view"],
+            marks=pytest.mark.slow,
+        ),
+    ],
+)  # fmt: skip
 def test_bench_writes_records(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    expected: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TRAITBRDF_SHARED", raising=False)
-    assert main(["bench", "table", "--quick", "--json", "records.json"]) == 0
+    assert main(["bench", name, "--quick", "--json", "records.json"]) == 0
     records = json.loads((tmp_path / "records.json").read_text())
-    assert {"name", "value", "unit", "target", "met", "error", "how"} == set(records[0])
-    assert all(np.isfinite(record["value"]) for record in records)
-    assert "table error, median" in capsys.readouterr().out
+    for record in records:
+        assert {"name", "value", "unit", "target", "met", "error", "how"} == set(record)
+        assert np.isfinite(record["value"])
+        assert (record["target"] is None) == (record["met"] is None)
+        if record["unit"] == "ms":  # what is timed was checked
+            assert 0.0 < record["error"] < 0.05
+    named = {record["name"] for record in records}
+    assert set(expected) <= named
+    said = capsys.readouterr().out
+    assert all(name in said for name in named)
 
 
 def test_record_says_when_a_target_is_missed() -> None:
     assert bench.Record.at_most("x", 1.0, "%", 2.0).met is True
+    assert bench.Record.at_least("x", 1.0, "dB", 2.0).met is False
+    assert bench.Record.at_least("x", 2.0, "dB", 2.0).met is True
     missed = bench.Record.at_most("x", 3.0, "%", 2.0)
     assert missed.met is False
     assert "MISSED" in missed.line()
@@ -127,6 +197,79 @@ def test_texel_sum_is_the_reference_for_a_rough_surface() -> None:
     plain = bench.texel_sum(scene, index, brdf)
     true, _ = bench.reference_values(scene, index, [brdf], 1e-4)
     assert tb.reference.relative_error(plain, true[:, 0]) < 2e-3
+
+
+def test_unseen_tables_are_new() -> None:
+    kinds = bench.unseen(None, quick=True)
+    assert {"held-out library", "new recipes", "manifold moves", "models"} <= set(kinds)
+    library = tb.default_library()
+    known = [library[name].values for name in library.names]
+    for table in kinds["new recipes"]:
+        assert min(float(np.abs(values - table.values).max()) for values in known) > 1e-3
+    held = {library.names[i] for i in range(0, len(library), bench.HELD_OUT)}
+    assert {table.name for table in kinds["held-out library"]} <= held
+
+
+def test_without_the_recipe_there_are_more_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_recipes = bench.unseen(None, quick=True)
+    monkeypatch.setattr(bench, "fresh_recipes", lambda count, seed=1: [])
+    without = bench.unseen(None, quick=True)
+    assert "new recipes" not in without
+    assert sum(map(len, without.values())) == sum(map(len, with_recipes.values()))
+
+
+def test_the_oracle_on_several_cores_is_the_same() -> None:
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=12, ground=True)
+    brdfs = [tb.default_library()[name] for name in ("white-plaster", "gold-satin")]
+    index = np.arange(0, len(scene.pixels), len(scene.pixels) // 40)
+    assert len(index) >= 32  # fewer are not shared out
+    values, errors = bench.reference_values(scene, index, brdfs, 1e-2)
+    expected = tb.reference.fragments(scene, index, brdfs, 1e-2)
+    np.testing.assert_array_equal(values, expected[0])
+    np.testing.assert_array_equal(errors, expected[1])
+
+
+def test_what_the_oracle_refuses_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=8, subsamples=1)
+    whole = tb.reference.fragments
+
+    def picky(scene, index, brdfs, tolerance):  # type: ignore[no-untyped-def]
+        if np.any(index % 7 == 0):
+            raise tb.reference.IntegrationError("point 0: too hard")
+        return whole(scene, index, brdfs, tolerance)
+
+    monkeypatch.setattr(tb.reference, "fragments", picky)
+    oracle = bench.Oracle([tb.default_library()["white-plaster"]], 1e-2, cores=1)
+    every = np.arange(len(scene.pixels))
+    values, _ = oracle(scene, every)
+    np.testing.assert_array_equal(np.isnan(values).any(axis=(1, 2)), every % 7 == 0)
+    index, known, _ = bench._drawn(oracle, scene, every, 20, np.random.default_rng(0))
+    assert np.isfinite(known).all()
+    assert not np.any(index % 7 == 0)
+    np.testing.assert_array_equal(known, values[index])
+
+
+def test_frame_errors_are_those_of_whole_pixels() -> None:
+    """Against the oracle's own picture, borders and backdrop included."""
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=12, ground=True)
+    session = tb.EditSession(scene, quality="preview")
+    session.assign("sphere", "white-plaster")
+    frame = session.render()
+    stated = bench._frame_error(session, len(scene.pixels), np.random.default_rng(0))
+    brdfs = {name: session.brdf(name) for name in scene.parts}
+    true = tb.reference.render(scene, brdfs, 1e-3).reshape(-1, 3)
+    backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
+    covered = np.unique(scene.pixels)
+    expected = tb.reference.relative_error(
+        frame.reshape(-1, 3)[covered] - backdrop[covered], true[covered] - backdrop[covered]
+    )
+    assert 0.0 < stated < 0.05
+    assert stated == pytest.approx(expected, rel=0.02)
+
+
+def test_peak_memory() -> None:
+    peak = bench._peak_memory()
+    assert peak is None or 0.05 < peak < 100.0
 
 
 @pytest.mark.parametrize(

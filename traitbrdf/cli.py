@@ -105,12 +105,9 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a procedural sky")
     parser.add_argument("--shape", choices=("teapot", "sphere"), default="teapot")
     parser.add_argument(
-        "--ground",
-        type=float,
-        default=0.0,
-        metavar="RADIUS",
-        help="of the disc that it stands on, in radii of the shape; 0 for none (%(default)s)",
-    )
+        "--ground", type=float, nargs="?", const=2.0, default=0.0, metavar="RADIUS",
+        help="let it stand on a disc, by default of 2 radii of the shape; 0 for none (%(default)s)",
+    )  # fmt: skip
     parser.add_argument("--size", type=_size, default=512, help="pixels (%(default)s)")
     parser.add_argument(
         "--camera", type=float, nargs=3, default=DEMO_CAMERA,
@@ -245,7 +242,7 @@ def _demo(given: argparse.Namespace) -> int:
     report = session.report()
     print(
         f"frame error, measured on probe pixels (mean relative L1): "
-        f"{100 * report['frame_error']:.3f} % of the object, "
+        f"{100 * report['frame_error']:.3f} % of all that is shown, "
         f"{100 * report['parts'][part]['error']:.3f} % of the {part}"
     )
     exposure = exposure_of(before)
