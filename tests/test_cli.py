@@ -219,7 +219,7 @@ def test_without_the_recipe_there_are_more_moves(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_oracle_on_several_cores_is_the_same() -> None:
-    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=12, ground=True)
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=12, subsamples=2)
     brdfs = [tb.default_library()[name] for name in ("white-plaster", "gold-satin")]
     index = np.arange(0, len(scene.pixels), len(scene.pixels) // 40)
     assert len(index) >= 32  # fewer are not shared out
@@ -251,7 +251,10 @@ def test_what_the_oracle_refuses_is_replaced(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_frame_errors_are_those_of_whole_pixels() -> None:
     """Against the oracle's own picture, borders and backdrop included."""
-    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=12, ground=True)
+    scene = tb.Scene(
+        tb.sphere(), tb.EnvironmentMap.sky(rows=128), camera=tb.Camera.orbit(20.0, 25.0, zoom=0.8),
+        size=10, ground=1.2, subsamples=2,
+    )  # fmt: skip
     session = tb.EditSession(scene, quality="preview")
     session.assign("sphere", "white-plaster")
     frame = session.render()
