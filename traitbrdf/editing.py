@@ -63,9 +63,9 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 QUALITIES: dict[str, tuple[int, float]] = {
-    "preview": (24, 0.7),
-    "interactive": (64, 1.0),
-    "accurate": (112, 1.5),
+    "preview": (40, 0.7),
+    "interactive": (112, 1.0),
+    "accurate": (160, 1.5),
 }
 """Basis images and resolution of the light for each quality."""
 

@@ -54,7 +54,7 @@ _LEVELS = (4, 2)
 """Spacing in pixels of the lattices on which far images are computed."""
 _CUT = (0.09, 1 / 500)
 """Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
-_BEND = (0.006, 0.12)
+_BEND = (0.003, 0.06)
 """Most that a normal departs from its cell's corners': from their mean, and from any."""
 _UNEVEN = 0.02
 """Most that a cell's corners differ in what light they see: see `_disagreement`."""
@@ -63,6 +63,8 @@ _QUESTIONS = 192
 _ALL = (-1.0, 9.0)
 _SHARED = ((4, 0.002), (2, 0.007))
 """Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
+_UNITED = 0.007
+"""The same for the samples of one fragment."""
 
 f32 = np.float32
 
@@ -262,14 +264,22 @@ class Operator:
             group[member[joined]] = found + np.repeat(np.arange(alike.sum()), size[alike])
             found += int(alike.sum())
             single = np.sort(member[~joined])
-        # a bundle is a group of fragments, or one fragment, whose samples are a group each
+        # a bundle is a group of fragments, or one fragment, whose samples are a group each, or one
+        several = np.flatnonzero(count > 1)
+        united = np.zeros(len(index), bool)
+        if len(several):
+            members, edge = _expand(starts, several)
+            united[several] = _alike(
+                edge[:-1], count[several], normals[members], views[members],
+                scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
+            )  # fmt: skip
         alone = group < 0
         group[alone] = found + np.arange(alone.sum())
         order = np.argsort(group, kind="stable")
         sorted_samples, _ = _expand(starts, order)
         per_fragment = count[order]
         bundle_of_sample = np.repeat(group[order], per_fragment)
-        own = bundle_of_sample >= found  # each sample its own group
+        own = (bundle_of_sample >= found) & ~united[owner[sorted_samples]]
         fresh = np.diff(bundle_of_sample, prepend=-1) != 0
         group_edge = np.flatnonzero(fresh | own)
         group_start = np.append(group_edge, len(sorted_samples))
@@ -1154,7 +1164,7 @@ def _walk(
                     elif d1 - d0 == 1:
                         fate = _DOUBTFUL
             seen = f32(1.0)
-            if fate == _PARTLY:
+            if fate == _PARTLY or (fate == _DOUBTFUL and nearest > outline):
                 for k in range(rows):
                     if _some(hidden, mask[k], first[i], last[i], True):
                         seen -= f32(1.0) / f32(rows)
@@ -1188,7 +1198,7 @@ def _walk(
                     piece = _push_quarters(cells, piece, t0, t1, f0, f1)
                     continue
             elif child[i, 0] == -2:
-                if fate == _DOUBTFUL and asked < len(ask):
+                if fate == _DOUBTFUL and nearest <= outline and asked < len(ask):
                     # one ray for the whole texel
                     ask[asked, 0], ask[asked, 1], ask[asked, 2] = cx, cy, cz
                     seen = f32(answers[asked])
@@ -1210,7 +1220,7 @@ def _walk(
                 continue
         if cos_i <= -spread:
             continue
-        if fate == _DOUBTFUL and asked < len(ask):
+        if fate == _DOUBTFUL and nearest <= outline and asked < len(ask) and not in_texel:
             ask[asked, 0], ask[asked, 1], ask[asked, 2] = cx, cy, cz
             seen = f32(answers[asked])
             asked += 1

@@ -6,12 +6,13 @@ table, I = W rho; `quadrature.Operator` knows the rows of W, shadows included.
 *Basis.* Seen through one part of one scene, the BRDFs of interest span few dimensions. From the
 rows W_S of a subset S of fragments and training tables X, the SVD of the column-normalised
 W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables whose images W M span
-the frames; Q = orth(W M), sorted by what the training set needs. Frame = Q (C rho). The orthogonal
-choice C = Q^T W needs every row; weighted least squares on some five times more rows than Q has
-columns comes within a tenth of its error, if the fragments with the greatest leverage in Q are
-among them and the rest is drawn at random (a uniform draw errs up to ten times as much on tables
-outside the training set). (Projecting rho on an orthonormal basis of cell space instead errs by
-tens of percent.)
+the frames; Q are the leading left singular vectors of W M Sigma. The three colours of a map light
+a shape much alike, so one Q serves them all: 100 columns err less than three times 64, and a frame
+reads them once. Frame = Q (C rho), with a C for each colour. The orthogonal choice C = Q^T W needs
+every row; weighted least squares on some five times more rows than Q has columns comes within a
+tenth of its error, if the fragments with the greatest leverage in Q are among them and the rest is
+drawn at random (a uniform draw errs up to ten times as much on tables outside the training set).
+(Projecting rho on an orthonormal basis of cell space instead errs by tens of percent.)
 
 *Error.* Some fragments, drawn evenly from all that are shown, keep their exact rows, built at twice
 the resolution, shadows too: comparing them gives every frame its measured error. (Drawing them from
@@ -61,14 +62,15 @@ class _Basis:
     """The compressed operator of a group of parts; C is 3, or 1 where all light is grey."""
 
     parts: range
-    basis: torch.Tensor  # Q^T (C, r, P): this way round a product with a vector is fastest
+    basis: torch.Tensor  # Q (P, r), of all colours
+    damping: torch.Tensor  # (P,) what the fit of a fragment was weighted with
     cells: torch.Tensor  # (n,) the cells of the grid that the group sees
     rows: torch.Tensor  # (C, r + m, n): the projection, and the probes' exact rows below it
     place: torch.Tensor | None = None  # (n,) where the cells are among the scene's; None: all
 
     @property
     def rank(self) -> int:
-        return self.basis.shape[1]
+        return self.basis.shape[-1]
 
     def at_cells(self, table: torch.Tensor) -> torch.Tensor:
         """(3, n) of a table (len(Transport.cells), 3)."""
@@ -173,7 +175,7 @@ class Transport:
     training : Training
         What the basis is fitted to: see `training_tables`.
     rank : int
-        At most so many basis images for each part and colour.
+        At most so many basis images for a group of parts.
     resolution : float
         As for `Operator`.
     seed : int
@@ -184,7 +186,9 @@ class Transport:
 
     TRAINING_ROWS = 320
     """Fragments of a group (S) on which the training tables are compared."""
-    FIT_FACTOR = 6
+    TABLES = 5 / 7
+    """Combinations of training tables for each basis image: their colours make up the rest."""
+    FIT_FACTOR = 5
     """Rows of the least-squares fit for each basis image."""
     PROBES = 20
     """Fragments of a part and colour that are kept exact, to measure errors."""
@@ -196,7 +200,7 @@ class Transport:
         scene: Scene,
         grid: HalfDiffGrid,
         training: Training,
-        rank: int = 64,
+        rank: int = 112,
         resolution: float = 1.0,
         seed: int = 0,
         device: str | torch.device = "cpu",
@@ -317,8 +321,9 @@ class Transport:
             images = torch.from_numpy(operator.part_images(part, mix, told))
             at = slice(span.start - fragments.start, span.stop - fragments.start)
             whole[:, at] = images.permute(1, 0, 2)[:colours]
-        damping = _damping(whole, colours * len(subset))
-        basis = _sorted_basis(whole.mul_(damping), need, self.rank, self.ENOUGH)
+        whole *= torch.from_numpy(need).float()
+        damping = _damping(whole)
+        basis = _leading(whole.mul_(damping[:, None]), self.rank, self.ENOUGH)
         del whole
         exact: list[Float32] = []
         for part in group:
@@ -363,7 +368,7 @@ class Transport:
     ) -> tuple[Float32, Float64]:
         """M = X Y Sigma^-1 (cells, R) for rows (m, 3, cells) of the subset, and Sigma (R,).
 
-        One M serves the three colours, so R is a quarter more than the rank.
+        One M serves the three colours, whose images differ: R is less than the rank.
         """
         colours = 1 if self.grey else 3
         stacked = torch.from_numpy(rows[:, :colours].reshape(-1, rows.shape[-1]))
@@ -374,7 +379,7 @@ class Transport:
         images = images * weight
         # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
         squares, u = _eigh(images @ images.T)
-        count = min(self.rank if self.grey else self.rank + self.rank // 4, len(squares))
+        count = min(self.rank if self.grey else math.ceil(self.TABLES * self.rank), len(squares))
         enough = squares.flip(0) > (0.1 * self.ENOUGH) ** 2 * squares[-1]
         count = max(1, min(count, int(enough.sum())))
         squares, u = squares.flip(0)[:count], u.flip(1)[:, :count]
@@ -393,25 +398,25 @@ class Transport:
         rng: np.random.Generator,
     ) -> _Basis:
         """The group's C by weighted least squares, and everything a frame reads."""
-        fragments, colours = self._fragments(group), len(basis)
+        fragments = self._fragments(group)
         chosen, importance = self._fit_rows(basis, len(fragments), rng)
-        rows = torch.from_numpy(self.operator.rows(chosen + fragments.start)[:, :colours])
+        rows = torch.from_numpy(self.operator.rows(chosen + fragments.start)[:, : len(exact)])
         probes = torch.from_numpy(exact)
         seen = (rows != 0.0).any(dim=0).any(dim=0) | (probes != 0.0).any(dim=0).any(dim=0)
         cells = torch.nonzero(seen)[:, 0]
-        weight = torch.from_numpy(importance)[:, None]
+        weight = torch.from_numpy(importance)
         at = torch.from_numpy(chosen)
-        sampled = basis[:, at].double() * weight
-        damped = (damping[:, at] * weight).transpose(1, 2)
-        squares, vectors = _eigh(sampled.transpose(1, 2) @ sampled)
-        keep = squares > 1e-9 * squares[:, -1:].clamp_min(1e-30)
+        sampled = basis[at].double() * weight[:, None]
+        squares, vectors = _eigh(sampled.T @ sampled)
+        keep = squares > 1e-9 * squares[-1].clamp_min(1e-30)
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
-        inverse = (vectors * scale[:, None, :]) @ vectors.transpose(1, 2)
-        solve = (inverse @ sampled.transpose(1, 2) * damped).float()
-        projection = torch.bmm(solve, rows[:, :, cells].permute(1, 0, 2))
+        inverse = (vectors * scale) @ vectors.T
+        solve = (inverse @ sampled.T * (damping[at] * weight)).float()
+        projection = torch.stack([solve @ rows[:, c, cells] for c in range(len(exact))])
         return _Basis(
             parts=group,
-            basis=(basis / damping).transpose(1, 2).contiguous().to(self.device),
+            basis=(basis / damping[:, None]).to(self.device),
+            damping=damping.to(self.device),
             cells=cells.to(self.device),
             rows=torch.cat([projection, probes[:, :, cells]], dim=1).to(self.device),
         )
@@ -421,7 +426,7 @@ class Transport:
     ) -> tuple[Int64, Float64]:
         """Fragments and weights of the least-squares fit: a third by leverage, others by chance."""
         count = min(self.FIT_FACTOR * basis.shape[-1], size)
-        leverage = (basis.double() ** 2).sum(dim=(0, 2)).numpy()
+        leverage = (basis**2).sum(dim=1).numpy()
         order = np.argsort(-leverage, kind="stable")
         leading, others = order[: count // 3], order[count // 3 :]
         drawn = rng.choice(others, count - len(leading), replace=False)
@@ -468,14 +473,11 @@ class Transport:
         if mine is None:
             return
         known = self.bases[mine.group]
-        colours = len(known.basis)
-        fresh = (radiance.T if colours == 3 else radiance.T.mean(dim=0, keepdim=True)).cpu()
-        images = torch.zeros((colours, known.basis.shape[2], known.rank + 1))
-        images[:, :, :-1] = known.basis.cpu().transpose(1, 2)
-        # the image counts as much as a basis image does
-        images[:, mine.span, -1] = fresh / fresh.norm(dim=1, keepdim=True).clamp_min(1e-30)
-        damping = _damping(images, images.shape[1])
-        basis = _orthonormal(images * damping)
+        damping = known.damping.cpu()
+        basis = known.basis.cpu() * damping[:, None]
+        fresh = torch.zeros((len(basis), 3))
+        fresh[mine.span] = radiance.cpu() * damping[mine.span, None]
+        basis = _extended(basis, fresh)
         exact = np.zeros((*known.rows[:, known.rank :].shape[:2], self.grid.size), np.float32)
         cells = known.cells.cpu().numpy()
         exact[:, :, cells] = known.rows[:, known.rank :].cpu().numpy()
@@ -492,7 +494,7 @@ class Transport:
             "resolution": np.array(self.resolution),
         }
         for i, basis in enumerate(self.bases):
-            for name in ("basis", "cells", "rows"):
+            for name in ("basis", "damping", "cells", "rows"):
                 known[f"{name}_{i}"] = getattr(basis, name).cpu().numpy()
         for i, part in enumerate(self.parts):
             if part is not None:
@@ -542,7 +544,8 @@ class Transport:
 
         for g, group in enumerate(self._groups()):
             fragments = self._fragments(group)
-            basis = taken(f"basis_{g}", "f", (colours, -1, len(fragments)))
+            basis = taken(f"basis_{g}", "f", (len(fragments), -1))
+            damping = taken(f"damping_{g}", "f", (len(fragments),))
             cells = indices(f"cells_{g}", (-1,), grid.size)
             known = 0
             for i in group:
@@ -565,9 +568,8 @@ class Transport:
                 )
                 known += probes.shape[1]
             rows = taken(f"rows_{g}", "f", (colours, basis.shape[1] + known, len(cells)))
-            self.bases.append(
-                _Basis(group, *(torch.from_numpy(a).to(self.device) for a in (basis, cells, rows)))
-            )
+            kept = (basis, damping, cells, rows)
+            self.bases.append(_Basis(group, *(torch.from_numpy(a).to(self.device) for a in kept)))
         self._join_cells()
         return self
 
@@ -592,18 +594,18 @@ class Transport:
             return torch.zeros((0, 3), device=self.device)
         basis = self.bases[known.group]
         coefficients = _per_colour(basis.rows[:, : basis.rank], basis.at_cells(table))
-        return _per_colour(basis.basis[:, :, known.span].transpose(1, 2), coefficients).T
+        return basis.basis[known.span] @ coefficients.T
 
-    def _project(self, group: int, table: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The table at the group's cells (3, n) and its coefficients (3, r); the last is kept,
-        since parts of one material follow each other."""
+    def _project(self, group: int, table: torch.Tensor) -> torch.Tensor:
+        """A table's coefficients and exact probes (3, r + m), in one product.
+
+        The last is kept, since parts of one material follow each other.
+        """
         key = (group, table._version)
         if not (self._projected and self._projected[0] is table and self._projected[1] == key):
             basis = self.bases[group]
-            columns = basis.at_cells(table)
-            coefficients = _per_colour(basis.rows[:, : basis.rank], columns)
-            self._projected = (table, key, columns, coefficients)
-        return self._projected[2], self._projected[3]
+            self._projected = (table, key, _per_colour(basis.rows, basis.at_cells(table)))
+        return self._projected[2]
 
     def shade(
         self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
@@ -623,12 +625,10 @@ class Transport:
             empty = torch.zeros((0, 3), device=self.device)
             return PartFrame(empty, 0.0, 0.0)
         basis = self.bases[known.group]
-        columns, coefficients = self._project(known.group, table)
-        shown = _per_colour(basis.basis[:, :, known.span].transpose(1, 2), coefficients)
-        shown = shown.clamp_min_(0.0)
-        pixels = shown.T
-        exact = self._probed(known, columns)
-        found = torch.gather(shown, 1, known.probes.expand(3, -1))
+        projected = self._project(known.group, table)
+        pixels = (basis.basis[known.span] @ projected[:, : basis.rank].T).clamp_min_(0.0)
+        exact = projected[:, basis.rank :][:, known.exact]
+        found = torch.gather(pixels, 0, known.probes.T.expand(-1, 3)).T
         deviation = float((found - exact).abs().mean())
         level = float(exact.mean())
         if mirror is not None and bool((mirror > 0.0).any()):
@@ -658,17 +658,13 @@ class Transport:
         if known is None:
             return PartFrame(radiance, 0.0, 0.0)
         seen = torch.from_numpy(table[self.cells]).to(self.device)
-        exact = self._probed(known, self.bases[known.group].at_cells(seen))
+        basis = self.bases[known.group]
+        rows = basis.rows[:, basis.rank :][:, known.exact]
+        exact = _per_colour(rows, basis.at_cells(seen))
         found = torch.gather(radiance.T, 1, known.probes.expand(3, -1))
         if mirror is not None:
             radiance = radiance + mirror * known.mirror
         return PartFrame(radiance, float((found - exact).abs().mean()), float(exact.mean()))
-
-    def _probed(self, part: _Part, columns: torch.Tensor) -> torch.Tensor:
-        """(3, m) exact radiance of a part's probes."""
-        basis = self.bases[part.group]
-        rows = slice(basis.rank + part.exact.start, basis.rank + part.exact.stop)
-        return _per_colour(basis.rows[:, rows], columns)
 
     def compose(self, frames: list[PartFrame]) -> torch.Tensor:
         """The frame (H, W, 3): the parts over the backdrop."""
@@ -780,46 +776,48 @@ def _eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return values, vectors
 
 
-def _damping(images: torch.Tensor, subset: int) -> torch.Tensor:
-    """Factors (3, P, 1), 1 but for pixels that stand far above all those of the subset.
+def _damping(images: torch.Tensor) -> torch.Tensor:
+    """Factors (P,) for images (C, P, R), 1 but for pixels that stand far above the others.
 
     At grazing views, or where one pixel of thousands mirrors the sun, unbounded lobes make a
-    pixel's images exceed the subset's a thousandfold. It would then fill the basis alone.
+    pixel's images exceed the others' a thousandfold. It would then fill the basis alone.
     """
-    energy = (images**2).sum(dim=-1, keepdim=True)
-    usual = images.shape[-1] / subset  # the images are orthonormal on the subset
-    return (30.0 * usual / energy.clamp_min(1e-30)).sqrt().clamp_max(1.0)
+    size = (images**2).sum(dim=(0, 2)).sqrt()
+    usual = size.mean()
+    for _ in range(8):  # the mean of what is left of them, whatever stands out
+        usual = size.minimum(10.0 * usual).mean()
+    return torch.where(size > 10.0 * usual, 10.0 * usual / size.clamp_min(1e-30), 1.0)
 
 
-def _orthonormal(images: torch.Tensor) -> torch.Tensor:
-    """An orthonormal basis (3, P, r) of the columns of images (3, P, r), by their Gram matrix.
+def _leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
+    """The leading left singular vectors (P, r) of images (C, P, R), all columns together.
 
-    The columns are nearly orthonormal to begin with; directions that vanish become zero columns.
+    At most `rank` of them, and none whose singular value is less than `enough` of the largest.
     """
-    basis = images
-    for _ in range(2):  # the second pass removes what float32 left of the first
-        gram = torch.stack([(b.T @ b).double() for b in basis])
-        values, vectors = _eigh(gram)
-        keep = values > 1e-6 * values[:, -1:].clamp_min(1e-30)
-        scale = torch.where(keep, torch.where(keep, values, 1.0).rsqrt(), 0.0)
-        basis = torch.bmm(basis, (vectors * scale[:, None, :]).float())
+    count, size = images.shape[0] * images.shape[2], images.shape[1]
+    gram = torch.zeros((count, count), dtype=torch.float64)
+    pieces = [slice(start, start + 8192) for start in range(0, size, 8192)]
+    for piece in pieces:  # singular values over eight decades: single precision would lose four
+        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        gram += columns.T @ columns
+    squares, vectors = _eigh(gram)
+    squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
+    kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
+    turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
+    basis = torch.empty((size, kept))
+    for piece in pieces:
+        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        basis[piece] = (columns @ turn).float()
     return basis
 
 
-def _sorted_basis(images: torch.Tensor, need: Float64, rank: int, enough: float) -> torch.Tensor:
-    """An orthonormal basis (C, P, r) of images (C, P, R), what is needed most first.
-
-    `need` (R,) says how much of each image the training set takes. At most `rank` columns, and
-    none that carries less than the share `enough` of the largest.
-    """
-    basis = _orthonormal(images)
-    scale = torch.from_numpy(need)
-    turned, sizes = [], []
-    for q, w in zip(basis, images, strict=True):
-        taken = (q.T @ w).double() * scale
-        squares, vectors = _eigh(taken @ taken.T)
-        turned.append(q @ vectors.flip(1)[:, :rank].float())
-        sizes.append(squares.flip(0)[:rank].clamp_min(0.0).sqrt())
-    share = torch.stack(sizes).max(dim=0).values
-    kept = int((share > enough * share[0]).sum())
-    return torch.stack(turned)[:, :, : max(kept, 1)].contiguous()
+def _extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+    """An orthonormal basis (P, r) and what images (P, 3) add to it."""
+    known, fresh = basis.double(), images.double()
+    fresh = fresh / fresh.norm(dim=0).clamp_min(1e-30)
+    for _ in range(2):  # the second pass removes what rounding left of the first
+        fresh = fresh - known @ (known.T @ fresh)
+    squares, vectors = _eigh(fresh.T @ fresh)
+    keep = squares > 1e-10  # grey light, or an image that is known already, adds fewer
+    fresh = (fresh @ vectors[:, keep]) * squares[keep].rsqrt()
+    return torch.cat([basis, fresh.float()], dim=1)
