@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from traitbrdf import editing, models, reference
 from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.directions import to_local
-from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession
+from traitbrdf.editing import EXACT_ABOVE, QUALITIES, EditSession, trusted_error
 from traitbrdf.embedding import Library, default_library
 from traitbrdf.lights import EnvironmentMap, texel_moments
 from traitbrdf.measured import MeasuredBRDF
@@ -320,7 +320,8 @@ def _shown(transport: Transport, tables: Sequence[TabulatedBRDF], index: Int64) 
             frame = transport.shade(part, cells)
             whole[scene.part_slice(part), b] = frame.radiance.numpy()
             measured[part, b] = frame.error
-    refused = measured > TRUSTED * EXACT_ABOVE
+    trusted = np.array([trusted_error(scene, part) for part in range(len(scene.parts))])
+    refused = measured > trusted[:, None]
     basis = whole[index]
     final = basis.copy()
     for part in range(len(scene.parts)):

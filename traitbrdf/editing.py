@@ -76,6 +76,10 @@ TRUSTED = 0.7
 """The basis is used where its measured error is at most this share of the error asked for: some
 dozens of probes are a noisy measurement."""
 
+SMALL_PART = 0.1
+"""Of parts that are a smaller share of the shape's pixels more error is borne, up to three times
+as much: it is lost in the frame's, and an exact frame would take a thousand times as long."""
+
 TRAINED_IMAGES = 8
 """At most so many exact images are taken into a basis."""
 
@@ -425,6 +429,14 @@ class _View:
 
 def _size(shown: _Shown) -> int:
     return shown.frame.radiance.numel() * shown.frame.radiance.element_size()
+
+
+def trusted_error(scene: Scene, part: int) -> float:
+    """The measured error up to which a session shows a part by the basis, if none is asked for."""
+    span = scene.part_slice(part)
+    shape = scene.part_slice(len(scene.shape.parts) - 1).stop
+    share = max(span.stop - span.start, 1) / max(shape, 1)
+    return TRUSTED * EXACT_ABOVE * min(max(1.0, math.sqrt(SMALL_PART / share)), 3.0)
 
 
 class EditSession:
@@ -1014,7 +1026,7 @@ class EditSession:
         if self.error is not None:
             return TRUSTED * self.error
         # if nothing is asked for, nothing is gained by exact frames that err as much
-        return max(TRUSTED * EXACT_ABOVE, view.floor.get(index, 0.0))
+        return max(trusted_error(view.scene, index), view.floor.get(index, 0.0))
 
     def _exactly(
         self,
@@ -1029,7 +1041,7 @@ class EditSession:
         part = transport.parts[index]
         with _TURNS.urgent():
             frame = transport.shade_exactly(index, values)
-            if frame.error > TRUSTED * EXACT_ABOVE:
+            if frame.error > trusted_error(view.scene, index):
                 view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
             allowed = self._allowed(view, index)
             budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)

@@ -27,8 +27,8 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numba
 import numpy as np
@@ -157,11 +157,32 @@ class Operator:
 
     # -- single fragments -----------------------------------------------------------------------
 
-    def rows(self, index: NDArray[np.integer]) -> Float32:
+    def rows(self, index: NDArray[np.integer], interpolate: bool = False) -> Float32:
         """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
         self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._add_lights(out, at, _NO_TABLES)
+        return out
+
+    def rows_as_shown(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3, grid.size) rows of distinct fragments `index` (m,), as `part_images` sees them.
+
+        With the shadows and the leaves that they share with the pixels around: the images and
+        these rows are of one operator, while those of `rows` are a little nearer to the truth.
+        """
+        at = np.asarray(index, np.int64)
+        out = np.zeros((len(at), 3, self.grid.size), np.float32)
+        for part in range(len(self.scene.parts)):
+            span = self.scene.part_slice(part)
+            mine = np.flatnonzero((at >= span.start) & (at < span.stop))
+            if not len(mine):
+                continue
+            place = np.full(span.stop - span.start, -1)
+            place[at[mine] - span.start] = mine
+            everything = np.arange(span.start, span.stop)
+            masks = self._plan(part).mask_rows
+            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -313,20 +334,26 @@ class Operator:
         window: tuple[float, float],
         tables: Float32,
         report: Callable[[float], None] = lambda fraction: None,
+        place: Int64 | None = None,
     ) -> None:
         """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
         `tables` (cells, T), or to their rows if there are no tables.
 
         `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
+        `place` (m,) says where in `out` each fragment is; those of -1 are left out.
         """
         step = 1 << 13
         light = self._light(window)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
-            bundles = self._bundles(index[at], mask_rows[at])
+            if place is not None and not (place[at] >= 0).any():
+                continue
+            bundles, target = self._bundles(index[at], mask_rows[at]), out[at]
+            if place is not None:
+                bundles, target = bundles.of(place[at]), out
             capacity = self._capacity
             while len(bundles.several):
-                short = self._shade_some(out[at], bundles, light, tables, capacity)
+                short = self._shade_some(target, bundles, light, tables, capacity)
                 bundles = bundles.take(short)
                 capacity *= 2
             report(at.stop / len(index))
@@ -350,14 +377,21 @@ class Operator:
             out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
         )  # fmt: skip
         again = (asked > 0) & ~short
+        # where rays decide, pixels do not share them
+        shared = again & (np.diff(bundles.group_start) > 1)
+        again &= ~shared
+        if shared.any():
+            apart = bundles.take(shared).separated()
+            while len(apart.several):
+                apart = apart.take(self._shade_some(out, apart, light, tables, capacity))
+                capacity *= 2
         if again.any():
             local, which = _questions(ask[again], asked[again])
             toward = turn_about_y(local, self.scene.environment.rotation)
             some = bundles.take(again)
-            # the middle member of a group asks for all
-            middle = (some.group_start[:-1] + some.group_start[1:]) // 2
             answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
-            answers[which] = self.scene.visible(some.sample[middle][which[0]], toward)
+            asker = some.sample[some.group_start[:-1]]
+            answers[which] = self.scene.visible(asker[which[0]], toward)
             count = len(some.several)
             _shade(  # type: ignore[call-arg]  # numba's decorator hides the signature
                 out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
@@ -412,9 +446,9 @@ class Operator:
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
         """Cast a part's rays and find where its far images are computed, if that is not done."""
-        self._plan(part, progress or (lambda stage, fraction: None))
+        self._plan(part, *([progress] if progress else []))
 
-    def _plan(self, part: int, report: Progress) -> _Plan:
+    def _plan(self, part: int, report: Progress = lambda stage, fraction: None) -> _Plan:
         if part not in self._plans:
             loose = max(1.0, 1.0 / self.resolution)
             self._plans[part] = _Plan.make(self.scene, part, self._visibility, loose, report)
@@ -441,10 +475,34 @@ class _Bundles:
     masks: NDArray[np.int32]  # (G, 4)
     several: NDArray[np.bool_]  # (G,) whether the fragment has other groups
 
+    _PER_SAMPLE: ClassVar = ("normals", "views", "share", "sample")
+
     def for_the_walk(self) -> tuple[Any, ...]:
         return (
             self.bundle_start, self.group_start, self.target, self.normals, self.views, self.share,
             self.middle_normals, self.middle_views, self.spread, self.masks, self.several,
+        )  # fmt: skip
+
+    def of(self, place: Int64) -> _Bundles:
+        """The samples of some fragments alone, in their groups; `place` renumbers the fragments,
+        and those of -1 are left out."""
+        target = place[self.target]
+        left = np.concatenate([[0], np.cumsum(target >= 0)])[self.group_start]
+        kept = replace(
+            self, group_start=left, target=target[target >= 0],
+            **{name: getattr(self, name)[target >= 0] for name in self._PER_SAMPLE},
+        )  # fmt: skip
+        return kept.take(np.diff(left) > 0)
+
+    def separated(self) -> _Bundles:
+        """Each sample in a group of its own."""
+        size = np.diff(self.group_start)
+        starts = np.arange(len(self.target) + 1)
+        return replace(
+            self, bundle_start=self.group_start[self.bundle_start], group_start=starts,
+            middle_normals=self.normals, middle_views=self.views,
+            spread=np.zeros(len(self.target), np.float32),
+            masks=np.repeat(self.masks, size, axis=0), several=np.repeat(self.several, size),
         )  # fmt: skip
 
     def take(self, groups: NDArray[np.bool_]) -> _Bundles:

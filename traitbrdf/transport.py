@@ -10,8 +10,9 @@ the frames; Q are the leading left singular vectors of W M Sigma. The three colo
 a shape much alike, so one Q serves them all: 100 columns err less than three times 64, and a frame
 reads them once. Frame = Q (C rho), with a C for each colour. The orthogonal choice C = Q^T W needs
 every row; weighted least squares on some five times more rows than Q has columns comes within a
-tenth of its error, if the fragments with the greatest leverage in Q are among them and the rest is
-drawn at random (a uniform draw errs up to ten times as much on tables outside the training set).
+third of its error, if half the fragments are drawn by their leverage in Q and half evenly, each
+weighted by its chance (a uniform draw errs up to ten times as much on tables outside the training
+set).
 (Projecting rho on an orthonormal basis of cell space instead errs by tens of percent.)
 
 *Error.* Some fragments, drawn evenly from all that are shown, keep their exact rows, built at twice
@@ -188,7 +189,7 @@ class Transport:
     """Fragments of a group (S) on which the training tables are compared."""
     TABLES = 5 / 7
     """Combinations of training tables for each basis image: their colours make up the rest."""
-    FIT_FACTOR = 5
+    FIT_FACTOR = 8
     """Rows of the least-squares fit for each basis image."""
     PROBES = 20
     """Fragments of a part and colour that are kept exact, to measure errors."""
@@ -400,10 +401,6 @@ class Transport:
         """The group's C by weighted least squares, and everything a frame reads."""
         fragments = self._fragments(group)
         chosen, importance = self._fit_rows(basis, len(fragments), rng)
-        rows = torch.from_numpy(self.operator.rows(chosen + fragments.start)[:, : len(exact)])
-        probes = torch.from_numpy(exact)
-        seen = (rows != 0.0).any(dim=0).any(dim=0) | (probes != 0.0).any(dim=0).any(dim=0)
-        cells = torch.nonzero(seen)[:, 0]
         weight = torch.from_numpy(importance)
         at = torch.from_numpy(chosen)
         sampled = basis[at].double() * weight[:, None]
@@ -412,30 +409,36 @@ class Transport:
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale) @ vectors.T
         solve = (inverse @ sampled.T * (damping[at] * weight)).float()
-        projection = torch.stack([solve @ rows[:, c, cells] for c in range(len(exact))])
+        rows = torch.zeros((len(exact), solve.shape[0] + exact.shape[1], self.grid.size))
+        rows[:, solve.shape[0] :] = torch.from_numpy(exact)
+        seen = (rows != 0.0).any(dim=0).any(dim=0)
+        for i in range(0, len(chosen), 128):
+            some = slice(i, i + 128)
+            # of the very operator that made the images: the fit would amplify any difference
+            shown = torch.from_numpy(self.operator.rows_as_shown(chosen[some] + fragments.start))
+            for c in range(len(exact)):
+                rows[c, : solve.shape[0]] += solve[:, some] @ shown[:, c]
+            seen |= (shown != 0.0).any(dim=0).any(dim=0)
+        cells = torch.nonzero(seen)[:, 0]
         return _Basis(
             parts=group,
             basis=(basis / damping[:, None]).to(self.device),
             damping=damping.to(self.device),
             cells=cells.to(self.device),
-            rows=torch.cat([projection, probes[:, :, cells]], dim=1).to(self.device),
+            rows=rows[:, :, cells].to(self.device),
         )
 
     def _fit_rows(
         self, basis: torch.Tensor, size: int, rng: np.random.Generator
     ) -> tuple[Int64, Float64]:
-        """Fragments and weights of the least-squares fit: a third by leverage, others by chance."""
+        """Fragments and weights of the least-squares fit, drawn half by leverage, half evenly."""
         count = min(self.FIT_FACTOR * basis.shape[-1], size)
-        leverage = (basis**2).sum(dim=1).numpy()
-        order = np.argsort(-leverage, kind="stable")
-        leading, others = order[: count // 3], order[count // 3 :]
-        drawn = rng.choice(others, count - len(leading), replace=False)
-        chosen = np.concatenate([leading, drawn])
-        # each drawn one speaks for its share of those that were not taken for leverage
-        share = math.sqrt(len(others) / max(len(drawn), 1))
-        weight = np.concatenate([np.ones(len(leading)), np.full(len(drawn), share)])
-        ascending = np.argsort(chosen)
-        return chosen[ascending], weight[ascending]
+        leverage = (basis.double() ** 2).sum(dim=1).numpy()
+        chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
+        chance /= chance.sum()
+        chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)
+        # each speaks for its share of those that were not drawn
+        return chosen, np.sqrt(times / (count * chance[chosen]))
 
     def _join_cells(self) -> None:
         """Gather the cells that any part sees: the others are neither decoded nor stored."""
