@@ -399,6 +399,12 @@ class LightTree:
     child: NDArray[np.int32]
     rectangle: NDArray[np.int32]
 
+    @cached_property
+    def flux(self) -> NDArray[np.float64]:
+        """(n,) length of each node's vector irradiance, all colours together."""
+        red, green, blue = self.moment.astype(np.float64).transpose(1, 0, 2)
+        return np.asarray(np.linalg.norm(red + green + blue, axis=-1))
+
     @classmethod
     def build(cls, environment: EnvironmentMap) -> LightTree:
         """Split the map in halves, across the longer side, down to single texels."""

@@ -91,7 +91,7 @@ class VisibilityCut:
     @classmethod
     def build(cls, tree: LightTree, spacing: float, share: float) -> VisibilityCut:
         """Cut where nodes are no wider than `spacing` and hold no more than `share` of the flux."""
-        flux = np.linalg.norm(tree.moment.sum(axis=1, dtype=np.float64), axis=-1)
+        flux = tree.flux
         whole = (tree.child < 0).all(axis=1)
         total = max(float(flux[whole].sum()), 1e-300)
         split = ~whole & ((tree.radius > spacing) | (flux > share * total))
@@ -139,7 +139,8 @@ class Operator:
         self._nodes = _pack(self.tree)
         self._image = environment.image
         scale = 1.0 / resolution
-        rule = np.array([0.5 * scale, scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
+        # sharp lobes are lost where the leaves at their peaks grow wider than these
+        rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
         self._rules = np.stack([rule, rule * (1.6, 2.56, 1.6, 1.6)]).astype(np.float32)
         self._capacity = int(1600 * resolution**2) + 200
         to_map = scene.environment.to_map
@@ -149,9 +150,8 @@ class Operator:
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
         self._visibility: _Visibility | None = None
         if any(scene.casts):
-            cut = VisibilityCut.build(
-                self.tree, _CUT[0] * min(scale, 1.0), _CUT[1] * min(scale, 1.0) ** 2
-            )
+            width = min(scale, math.sqrt(scale))  # shadows blur less well than lobes do
+            cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
             self._visibility = _Visibility(scene, cut, self._middle)
         self._plans: dict[int, _Plan] = {}
 
@@ -286,12 +286,12 @@ class Operator:
             found += int(alike.sum())
             single = np.sort(member[~joined])
         # a bundle is a group of fragments, or one fragment, whose samples are a group each, or one
-        several = np.flatnonzero(count > 1)
+        sampled = np.flatnonzero(count > 1)
         united = np.zeros(len(index), bool)
-        if len(several):
-            members, edge = _expand(starts, several)
-            united[several] = _alike(
-                edge[:-1], count[several], normals[members], views[members],
+        if len(sampled):
+            members, edge = _expand(starts, sampled)
+            united[sampled] = _alike(
+                edge[:-1], count[sampled], normals[members], views[members],
                 scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
             )  # fmt: skip
         alone = group < 0
@@ -1324,9 +1324,9 @@ def _stencils(
 ) -> None:  # fmt: skip
     """First cells and interpolation weights of leaves: free of branches, so that it vectorises.
 
-    cell (2, n): the lowest cell of the nearer theta_h sample, and how many theta_h nodes further
-    the other one starts; place (7, n): fractions along theta_h (both samples), theta_d, phi_d, and
-    the irradiance RGB.
+    cell (3, n): theta_h and theta_d of the lowest cell of the nearer theta_h sample as one index,
+    how many theta_h nodes further the other one starts, and phi_d; place (7, n): fractions along
+    theta_h (both samples), theta_d, phi_d, and the irradiance RGB.
     """
     n0, n1, n2 = n[0], n[1], n[2]
     v0, v1, v2 = v[0], v[1], v[2]
@@ -1368,8 +1368,9 @@ def _stencils(
         a1 = min(np.int32(f32(math.sqrt(far / half_pi)) * k), np.int32(n_h - 2))
         start = f32(a1) * f32(a1)
         fb = (far / half_pi * k * k - start) / (f32(2.0) * f32(a1) + f32(1.0))
-        cell[0, q] = (a0 * n_d + b0) * n_p + c0
+        cell[0, q] = a0 * n_d + b0
         cell[1, q] = a1 - a0
+        cell[2, q] = c0
         place[0, q] = min(max(fa, f32(0.0)), f32(1.0))
         place[1, q] = min(max(fb, f32(0.0)), f32(1.0))
         place[2, q] = min(y - f32(b0), f32(1.0))
@@ -1384,89 +1385,81 @@ def _stencils(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _add_cells(
-    out: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
+def _collect(
+    row: Any, touched: Any, found: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
     n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
-) -> None:  # fmt: skip
-    """Add one sample's leaves to its row `out` (3, cells)."""
-    _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
-    half = f32(0.5) * share
-    for q in range(count):
-        fb, fc = place[2, q], place[3, q]
-        e0, e1, e2 = half * place[4, q], half * place[5, q], half * place[6, q]
-        for side in range(2):
-            fa = place[side, q]
-            base = cell[0, q] + side * cell[1, q] * n_d * n_p
-            for a in range(2):
-                wa = fa if a else f32(1.0) - fa
-                for b in range(2):
-                    wb = wa * (fb if b else f32(1.0) - fb)
-                    for c in range(2):
-                        w = wb * (fc if c else f32(1.0) - fc)
-                        k = base + (a * n_d + b) * n_p + c
-                        out[0, k] += w * e0
-                        out[1, k] += w * e1
-                        out[2, k] += w * e2
+) -> Any:  # fmt: skip
+    """Add one sample's leaves to a row (cells, 4), RGB and a filler.
 
-
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _add_leaves(
-    out: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
-    n_h: Any, n_d: Any, n_p: Any, tables: Any, cell: Any, place: Any,
-) -> None:  # fmt: skip
-    """Add one sample's leaves to its radiance `out` (3, T) under tables (cells, T)."""
-    step = n_d * n_p
+    `touched[0]` lists the `found` pairs of theta_h and theta_d that hold something, `touched[1]`
+    says which these are; returns how many there are now.
+    """
     _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
     for q in range(count):
         e0, e1, e2 = share * place[4, q], share * place[5, q], share * place[6, q]
         if e0 + e1 + e2 == f32(0.0):
             continue
-        fb, fc = place[2, q], place[3, q]
-        w0 = f32(0.5) * (f32(1.0) - fb) * (f32(1.0) - fc)
-        w1 = f32(0.5) * (f32(1.0) - fb) * fc
-        w2 = f32(0.5) * fb * (f32(1.0) - fc)
-        w3 = f32(0.5) * fb * fc
-        g0 = place[0, q]
-        g1 = place[1, q]
-        i = cell[0, q]
-        j = i + step
-        if cell[1, q] == 0:
-            # both samples lie between the same theta_h nodes
-            g0 += g1
-            h0 = f32(2.0) - g0
-            for t in range(tables.shape[1]):
-                x = h0 * (
-                    w0 * tables[i, t] + w1 * tables[i + 1, t]
-                    + w2 * tables[i + n_p, t] + w3 * tables[i + n_p + 1, t]
-                ) + g0 * (
-                    w0 * tables[j, t] + w1 * tables[j + 1, t]
-                    + w2 * tables[j + n_p, t] + w3 * tables[j + n_p + 1, t]
-                )  # fmt: skip
-                out[0, t] += e0 * x
-                out[1, t] += e1 * x
-                out[2, t] += e2 * x
+        fb, fc, c = place[2, q], place[3, q], cell[2, q]
+        sides = 1 if cell[1, q] == 0 else 2  # both samples may lie between the same nodes
+        for side in range(sides):
+            weight = f32(1.0) if sides == 1 else f32(0.5)
+            fa = f32(0.5) * (place[0, q] + place[1, q]) if sides == 1 else place[side, q]
+            base = cell[0, q] + side * cell[1, q] * n_d
+            for a in range(2):
+                wa = weight * (fa if a else f32(1.0) - fa)
+                for b in range(2):
+                    w1 = wa * (fb if b else f32(1.0) - fb)
+                    w0 = w1 * (f32(1.0) - fc)
+                    w1 *= fc
+                    i = base + a * n_d + b
+                    if touched[1, i] == 0:
+                        touched[1, i] = 1
+                        touched[0, found] = i
+                        found += 1
+                    k = i * n_p + c
+                    row[k, 0] += w0 * e0
+                    row[k, 1] += w0 * e1
+                    row[k, 2] += w0 * e2
+                    row[k, 3] += w0  # nothing reads it, but four are one vector
+                    row[k + 1, 0] += w1 * e0
+                    row[k + 1, 1] += w1 * e1
+                    row[k + 1, 2] += w1 * e2
+                    row[k + 1, 3] += w1
+    return found
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+def _release(out: Any, row: Any, touched: Any, found: Any, n_p: Any, tables: Any) -> None:
+    """Add a row to `out`: (3, T) its radiance under tables (cells, T), or (3, cells) itself where
+    `tables` has no column; then clear it."""
+    for j in range(found):
+        i = touched[0, j]
+        touched[1, i] = 0
+        k, end = i * n_p, i * n_p + n_p
+        if tables.shape[1] == 0:
+            for m in range(k, end):
+                for c in range(3):
+                    out[c, m] += row[m, c]
         else:
-            h0, h1 = f32(1.0) - g0, f32(1.0) - g1
-            k = i + cell[1, q] * step
-            m = k + step
-            for t in range(tables.shape[1]):
-                x = h0 * (
-                    w0 * tables[i, t] + w1 * tables[i + 1, t]
-                    + w2 * tables[i + n_p, t] + w3 * tables[i + n_p + 1, t]
-                ) + g0 * (
-                    w0 * tables[j, t] + w1 * tables[j + 1, t]
-                    + w2 * tables[j + n_p, t] + w3 * tables[j + n_p + 1, t]
-                )  # fmt: skip
-                x += h1 * (
-                    w0 * tables[k, t] + w1 * tables[k + 1, t]
-                    + w2 * tables[k + n_p, t] + w3 * tables[k + n_p + 1, t]
-                ) + g1 * (
-                    w0 * tables[m, t] + w1 * tables[m + 1, t]
-                    + w2 * tables[m + n_p, t] + w3 * tables[m + n_p + 1, t]
-                )  # fmt: skip
-                out[0, t] += e0 * x
-                out[1, t] += e1 * x
-                out[2, t] += e2 * x
+            while k + 2 < end:  # three rows of the tables for each pass over `out`
+                x0, x1, x2 = row[k, 0], row[k + 1, 0], row[k + 2, 0]
+                y0, y1, y2 = row[k, 1], row[k + 1, 1], row[k + 2, 1]
+                z0, z1, z2 = row[k, 2], row[k + 1, 2], row[k + 2, 2]
+                if x0 + x1 + x2 + y0 + y1 + y2 + z0 + z1 + z2 > f32(0.0):
+                    for t in range(tables.shape[1]):
+                        f0, f1, f2 = tables[k, t], tables[k + 1, t], tables[k + 2, t]
+                        out[0, t] += x0 * f0 + x1 * f1 + x2 * f2
+                        out[1, t] += y0 * f0 + y1 * f1 + y2 * f2
+                        out[2, t] += z0 * f0 + z1 * f1 + z2 * f2
+                k += 3
+            while k < end:
+                for c in range(3):
+                    for t in range(tables.shape[1]):
+                        out[c, t] += row[k, c] * tables[k, t]
+                k += 1
+        for m in range(i * n_p, end):
+            for c in range(4):
+                row[m, c] = f32(0.0)
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
@@ -1475,20 +1468,20 @@ def _one_leaf(
     n_h: Any, n_d: Any, n_p: Any, tables: Any,
 ) -> None:  # fmt: skip
     """Add one leaf (13, 1) a sample: to radiance, or to rows where `tables` has no column."""
-    for f in numba.prange(len(out)):
-        cell = np.empty((2, 1), np.int32)
-        place = np.empty((7, 1), np.float32)
-        for p in range(starts[f], starts[f + 1]):
-            if tables.shape[1] > 0:
-                _add_leaves(
-                    out[f], normals[p], views[p], share[p], 1, leaves[p],
-                    n_h, n_d, n_p, tables, cell, place,
+    block = 64
+    for u in numba.prange((len(out) + block - 1) // block):
+        cell = np.empty((3, 1), np.int32)
+        part = np.empty((7, 1), np.float32)
+        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
+        touched = np.zeros((2, n_h * n_d), np.int32)
+        for f in range(u * block, min(u * block + block, len(out))):
+            found = 0
+            for p in range(starts[f], starts[f + 1]):
+                found = _collect(
+                    row, touched, found, normals[p], views[p], share[p], 1, leaves[p],
+                    n_h, n_d, n_p, cell, part,
                 )  # fmt: skip
-            else:
-                _add_cells(
-                    out[f], normals[p], views[p], share[p], 1, leaves[p],
-                    n_h, n_d, n_p, cell, place,
-                )  # fmt: skip
+            _release(out[f], row, touched, found, n_p, tables)
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
@@ -1506,15 +1499,19 @@ def _shade(
     Unless this is the `final` call, groups with questions are left out; groups with more leaves
     than the capacity always are (`short`).
     """
-    block = 8
+    block = 16
     bundles = len(bundle_start) - 1
     for u in numba.prange((bundles + block - 1) // block):
         stack = np.empty(512, np.int32)
         fates = np.empty(512, np.int8)
         cells = np.empty((256, 4), np.float32)
         leaves = np.empty((13, capacity), np.float32)
-        cell = np.empty((2, capacity), np.int32)
+        cell = np.empty((3, capacity), np.int32)
         part = np.empty((7, capacity), np.float32)
+        # every sample of a fragment goes into one row: its neighbours touch the same cells
+        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
+        touched = np.zeros((2, n_h * n_d), np.int32)
+        found, current = 0, -1
         for g in range(bundle_start[u * block], bundle_start[min(u * block + block, bundles)]):
             count, asked[g] = _walk(
                 leaves, ask[g], answers[g], middle_normals[g], middle_views[g], masks[g],
@@ -1528,13 +1525,13 @@ def _shade(
             if asked[g] > 0 and not final:
                 continue
             for p in range(group_start[g], group_start[g + 1]):
-                if tables.shape[1] > 0:
-                    _add_leaves(
-                        out[target[p]], normals[p], views[p], share[p], count, leaves,
-                        n_h, n_d, n_p, tables, cell, part,
-                    )  # fmt: skip
-                else:
-                    _add_cells(
-                        out[target[p]], normals[p], views[p], share[p], count, leaves,
-                        n_h, n_d, n_p, cell, part,
-                    )  # fmt: skip
+                if target[p] != current and found > 0:
+                    _release(out[current], row, touched, found, n_p, tables)
+                    found = 0
+                current = target[p]
+                found = _collect(
+                    row, touched, found, normals[p], views[p], share[p], count, leaves,
+                    n_h, n_d, n_p, cell, part,
+                )  # fmt: skip
+        if found > 0:
+            _release(out[current], row, touched, found, n_p, tables)

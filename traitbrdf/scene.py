@@ -21,6 +21,7 @@ from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, PointLight
 from traitbrdf.shapes import Hits, Shape
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
@@ -122,6 +123,12 @@ class Camera:
         return np.array([math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a)])
 
 
+_SEEN = (
+    "part_image", "uncovered", "pixels", "pixel_part", "weights", "bordering", "offsets",
+    "normals", "views", "positions", "starts", "_sample_part",
+)  # fmt: skip
+
+
 class Scene:
     """A shape under light, seen by a camera.
 
@@ -187,6 +194,19 @@ class Scene:
         where the shape has a part named "ground" of its own.
     """
 
+    part_image: Int32
+    uncovered: NDArray[np.float32]
+    pixels: Int64
+    pixel_part: Int32
+    weights: Float64
+    bordering: Bool
+    offsets: Int64
+    normals: Float64
+    views: Float64
+    positions: Float64
+    starts: Float64
+    _sample_part: Int32
+
     def __init__(
         self,
         shape: Shape,
@@ -222,7 +242,14 @@ class Scene:
                 raise ValueError(f"ground: expected a shape without a part {GROUND!r}, got one")
             self.parts = (*self.parts, GROUND)
         self._light(environment, lights, shadows)
-        self._see()
+
+    def __getattr__(self, name: str) -> Any:
+        # primary rays are shot when something first asks for what they hit: a scene of which only
+        # a small version is drawn yet costs none
+        if name in _SEEN:
+            self._see()
+            return self.__dict__[name]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def _light(
         self, environment: EnvironmentMap | None, lights: Sequence[Light], shadows: bool
@@ -419,7 +446,6 @@ class Scene:
         y, x = np.divmod(np.arange(size), self.width)
         origin = self.camera.position(self.shape, self.height, self.width)
         hits = self._shoot(origin, x + 0.5, y + 0.5)
-        self.part_image = hits.part.reshape(self.height, self.width)
         border = np.zeros(size, dtype=bool)
         if self.subsamples > 1:
             border = self._borders(origin, hits)
@@ -435,33 +461,34 @@ class Scene:
         part = np.concatenate([hits.part[inner], fine.part[met]])
         # part by part, so that a part's fragments are one slice
         order = np.argsort(part.astype(np.int64) * size + pixel, kind="stable")
-        pixel, self._sample_part = pixel[order], part[order]
+        pixel, part = pixel[order], part[order]
 
         def gathered(name: str) -> Float64:
             both = [getattr(hits, name)[inner], getattr(fine, name)[met]]
             return np.concatenate(both)[order]
 
-        self.normals = gathered("normal")
-        self.positions = gathered("position")
-        self.starts = gathered("start")
-        self.views = -self.camera.through(
+        toward = self.camera.through(
             self.height,
             self.width,
             np.concatenate([x[inner] + 0.5, fine_x[met]])[order],
             np.concatenate([y[inner] + 0.5, fine_y[met]])[order],
         )
         new = np.ones(len(pixel) + 1, dtype=bool)
-        new[1:-1] = (pixel[1:] != pixel[:-1]) | (self._sample_part[1:] != self._sample_part[:-1])
+        new[1:-1] = (pixel[1:] != pixel[:-1]) | (part[1:] != part[:-1])
         new[-1] = True
-        self.offsets = np.flatnonzero(new) if len(pixel) else np.zeros(1, dtype=np.int64)
-        first, count = self.offsets[:-1], np.diff(self.offsets)
-        self.pixels = pixel[first]
-        self.pixel_part = self._sample_part[first]
-        self.bordering = border[self.pixels]
-        self.weights = np.where(self.bordering, count / self.subsamples, 1.0)
+        offsets = np.flatnonzero(new) if len(pixel) else np.zeros(1, dtype=np.int64)
+        first, count = offsets[:-1], np.diff(offsets)
+        bordering = border[pixel[first]]
         missed = (hits.part < 0).astype(np.float32)
         missed[at_border] = np.mean(fine.part.reshape(-1, self.subsamples) < 0, axis=1)
-        self.uncovered = missed
+        # all at once: another thread may be asking
+        self.__dict__.update(
+            part_image=hits.part.reshape(self.height, self.width),
+            normals=gathered("normal"), positions=gathered("position"), starts=gathered("start"),
+            views=-toward, _sample_part=part, offsets=offsets, pixels=pixel[first],
+            pixel_part=part[first], bordering=bordering,
+            weights=np.where(bordering, count / self.subsamples, 1.0), uncovered=missed,
+        )  # fmt: skip
 
     def _shoot(self, origin: Float64, x: Float64, y: Float64) -> Hits:
         """What the camera at `origin` sees through image positions x, y (n,)."""
@@ -505,7 +532,7 @@ class Scene:
         Another part or nothing is seen, the surface is bent sharply, or it goes on elsewhere.
         """
         frame = (self.height, self.width)
-        part = self.part_image
+        part = hits.part.reshape(frame)
         normal = hits.normal.reshape(*frame, 3)
         position = hits.position.reshape(*frame, 3)
         offset = hits.position - origin

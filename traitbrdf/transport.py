@@ -221,14 +221,14 @@ class Transport:
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
         # the next part's rays are cast while others are shaded
-        cancelled = threading.Event()
+        cancelled, operator = threading.Event(), self.operator
 
         def cast(part: int) -> None:
             def check(stage: str, fraction: float) -> None:
                 if cancelled.is_set():
                     raise concurrent.futures.CancelledError
 
-            self.operator.prepare(part, check)
+            operator.prepare(part, check)
 
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             try:
@@ -432,7 +432,9 @@ class Transport:
         self, basis: torch.Tensor, size: int, rng: np.random.Generator
     ) -> tuple[Int64, Float64]:
         """Fragments and weights of the least-squares fit, drawn half by leverage, half evenly."""
-        count = min(self.FIT_FACTOR * basis.shape[-1], size)
+        count = self.FIT_FACTOR * basis.shape[-1]
+        if count >= size:
+            return np.arange(size), np.ones(size)
         leverage = (basis.double() ** 2).sum(dim=1).numpy()
         chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
         chance /= chance.sum()
@@ -608,7 +610,8 @@ class Transport:
         if not (self._projected and self._projected[0] is table and self._projected[1] == key):
             basis = self.bases[group]
             self._projected = (table, key, _per_colour(basis.rows, basis.at_cells(table)))
-        return self._projected[2]
+        known: torch.Tensor = self._projected[2]
+        return known
 
     def shade(
         self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
@@ -707,7 +710,7 @@ class Draft:
         scene: Scene,
         grid: HalfDiffGrid,
         size: int = 128,
-        resolution: float = 0.25,
+        resolution: float = 0.12,
         tree: LightTree | None = None,
         seed: int = 0,
     ) -> None:
