@@ -617,6 +617,36 @@ def test_the_report_is_plain_finite_json(edit):
     assert edit.report()["parts"]["body"]["material"] == "red-rubber"
 
 
+def test_frames_are_the_callers(fresh):
+    """Memory is used again, but never that of a frame, or part of one, that somebody holds."""
+    edit = fresh()
+    kept, copies = [], []
+    for k in range(8):
+        edit.move("body", shiny=0.1)
+        image = edit.render()
+        kept.append((image, image[3:9], torch.from_numpy(image))[k % 3])
+        copies.append(np.asarray(kept[-1]).copy())
+        del image
+    for held, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(np.asarray(held), copy)
+    edit.render()[:] = -1.0
+    assert edit.render().min() >= 0.0
+
+
+def test_small_parts_bear_more_error(fresh):
+    scene = fresh().scene
+    counts = np.bincount(scene.pixel_part, minlength=len(scene.parts))
+    allowed = np.array([editing.trusted_error(scene, i) for i in range(len(counts))])
+    share = counts / counts[: len(scene.shape.parts)].sum()
+    assert (allowed[share >= 0.1] == editing.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed <= 3.0 * editing.TRUSTED * editing.EXACT_ABOVE).all()
+    small = share < 0.1
+    assert small.any()
+    assert (allowed[small] > editing.TRUSTED * editing.EXACT_ABOVE).all()
+    # together they add no more to the frame's error than a part of a tenth of the shape may
+    assert (allowed * share)[small].max() <= 0.1 * editing.TRUSTED * editing.EXACT_ABOVE
+
+
 def test_the_report_says_what_was_left_out(prepared_ball):
     session = over(prepared_ball, error=1.0)
     session.render()

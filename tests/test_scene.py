@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 import time
 
 import numpy as np
@@ -991,3 +992,38 @@ def test_cameras_take_numbers_of_any_kind():
 def test_lights_are_kept():
     lights = [PointLight((1.0, 2.0, 3.0)), DirectionalLight((0.0, 1.0, 0.0))]
     assert Scene(sphere(), SKY, lights, size=2).lights == tuple(lights)
+
+
+# -- primary rays on demand -------------------------------------------------------------------
+
+
+class Counted:
+    """A shape that counts the rays it is asked about."""
+
+    def __init__(self, shape):
+        self._shape, self.rays = shape, 0
+
+    def __getattr__(self, name):
+        return getattr(self._shape, name)
+
+    def intersect(self, origins, directions):
+        self.rays += len(directions)
+        return self._shape.intersect(origins, directions)
+
+
+def test_primary_rays_wait_until_they_are_needed():
+    shape = Counted(sphere())
+    scene = Scene(shape, SKY, size=300, ground=True)
+    small = scene.changed(size=16, subsamples=1)
+    lit = scene.changed(environment=EnvironmentMap.sky(rows=8))
+    assert shape.rays == 0
+    assert len(small.pixels) > 0
+    assert shape.rays == 16 * 16
+    assert len(lit.normals) > 90_000
+    once = shape.rays
+    assert len(lit.pixels) == len(lit.weights) <= len(lit.positions)
+    assert shape.rays == once
+    with pytest.raises(AttributeError, match="colour"):
+        _ = scene.colour
+    again = pickle.loads(pickle.dumps(Scene(sphere(), SKY, size=8)))  # noqa: S301
+    np.testing.assert_array_equal(again.pixels, Scene(sphere(), SKY, size=8).pixels)

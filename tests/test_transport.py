@@ -17,6 +17,7 @@ from traitbrdf.embedding import GRID, default_library
 from traitbrdf.lights import DirectionalLight, EnvironmentMap, LightTree, PointLight
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.models import AshikhminShirley, Lambert
+from traitbrdf.quadrature import Operator
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import sphere, teapot
 from traitbrdf.transport import Draft, Training, Transport, training_tables
@@ -318,6 +319,31 @@ def test_what_a_build_holds(built, small_sphere):
     assert torch.isfinite(q).all()
     assert ((q**2).sum(dim=0) > 0.999).all()
     assert torch.linalg.matrix_rank(q) == q.shape[1]
+
+
+def test_rays_are_cast_once(training):
+    """Behind, for the next part, while another one is shaded: by one operator."""
+    cast = []
+    for _ in range(3):
+        scene = ball(24)
+        Transport(scene, GRID, training, rank=8)
+        cast.append(scene.rays_cast)
+    scene = ball(24)
+    operator = Operator(scene, GRID)
+    for part in range(len(scene.parts)):
+        operator.prepare(part)
+    assert cast[0] == cast[1] == cast[2]
+    # the subset and the probes have rays of their own
+    assert scene.rays_cast < cast[0] < 20 * scene.rays_cast
+
+
+def test_a_part_alone_reads_its_own_rows(on_ground):
+    table = torch.from_numpy(flat(LIBRARY["gold-satin"])[on_ground.cells])
+    for part in range(len(on_ground.parts)):
+        alone = on_ground.shade(part, table.clone(), alone=True)
+        beside = on_ground.shade(part, table.clone())
+        torch.testing.assert_close(alone.radiance, beside.radiance, rtol=1e-4, atol=1e-6)
+        assert alone.error == pytest.approx(beside.error, rel=1e-3)
 
 
 def test_cells_that_nobody_sees_do_not_count(built):

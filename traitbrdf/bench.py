@@ -352,7 +352,7 @@ def _how_much(transport: Transport) -> str:
 
 def transport_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     """Transport error on unseen BRDFs: compressed frames against the oracle, same tables."""
-    size, count = (48, 16) if quick else (128, 300)
+    size, count = (48, 16) if quick else (512, 120)
     library = default_library()
     grid = library.embedding.grid_
     training = training_set(library, quick)

@@ -24,10 +24,11 @@ import importlib.metadata
 import json
 import math
 import os
+import sys
 import threading
 import time
 import weakref
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
@@ -64,8 +65,8 @@ Int64 = NDArray[np.int64]
 
 QUALITIES: dict[str, tuple[int, float]] = {
     "preview": (40, 0.7),
-    "interactive": (112, 1.0),
-    "accurate": (160, 1.5),
+    "interactive": (96, 1.0),
+    "accurate": (144, 1.5),
 }
 """Basis images and resolution of the light for each quality."""
 
@@ -343,6 +344,7 @@ class _Canvas:
         self._mixed = (several | (scene.uncovered > 0.0))[scene.pixels]
         self._patches: dict[int | None, tuple[torch.Tensor, list[Any]]] = {}
         self._drawn: list[PartFrame] = []
+        self._copies: list[Float32] = []
         self._image = self._backdrop
         self.changed: list[int] = []
 
@@ -395,7 +397,15 @@ class _Canvas:
     def image(self) -> Float32:
         """A copy (H, W, 3) of the frame."""
         scene = self._transport.scene
-        return np.array(self._image.cpu().numpy()).reshape(scene.height, scene.width, 3)
+        # new pages cost ten times the copy: those of a frame that nobody holds are used again
+        for copy in self._copies:
+            if sys.getrefcount(copy) == 3:  # the list, this loop and the question itself
+                break
+        else:
+            copy = np.empty((scene.height, scene.width, 3), np.float32)
+            self._copies = [copy, *self._copies[:2]]
+        copy[...] = self._image.cpu().numpy().reshape(copy.shape)
+        return copy
 
 
 @dataclass(eq=False)
@@ -977,9 +987,11 @@ class EditSession:
     def _frame(self, view: _View, transport: Transport) -> Float32:
         start = time.perf_counter()
         tables: dict[Material, torch.Tensor] = {}
+        materials = [self._materials[part] for part in view.scene.parts]
+        wanted = Counter(m for i, m in enumerate(materials) if (i, m) not in view.kept)
         shown = [
-            self._shade(view, transport, i, self._materials[part], tables)
-            for i, part in enumerate(view.scene.parts)
+            self._shade(view, transport, i, material, tables, wanted[material] == 1)
+            for i, material in enumerate(materials)
         ]
         if view.canvas is None:
             view.canvas = _Canvas(transport)
@@ -996,8 +1008,10 @@ class EditSession:
         index: int,
         material: Material,
         tables: dict[Material, torch.Tensor],
+        alone: bool,
     ) -> _Shown:
-        """One part's shading; `tables` holds what was decoded for this frame."""
+        """One part's shading; `tables` holds what was decoded for this frame, and `alone` says
+        that only this part wants its material's."""
         known = view.kept.get((index, material))
         if known is not None:
             view.kept.move_to_end((index, material))
@@ -1009,7 +1023,7 @@ class EditSession:
         mirror = None
         if material.mirror.any():
             mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
-        frame = transport.shade(index, tables[material], mirror)
+        frame = transport.shade(index, tables[material], mirror, alone)
         tier: Literal["basis", "trained", "exact"] = "basis"
         part = transport.parts[index]
         if part is not None and part.group in view.budget:

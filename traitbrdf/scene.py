@@ -125,7 +125,7 @@ class Camera:
 
 _SEEN = (
     "part_image", "uncovered", "pixels", "pixel_part", "weights", "bordering", "offsets",
-    "normals", "views", "positions", "starts", "_sample_part",
+    "normals", "views", "positions", "starts", "_sample_part", "_bounds",
 )  # fmt: skip
 
 
@@ -206,6 +206,7 @@ class Scene:
     positions: Float64
     starts: Float64
     _sample_part: Int32
+    _bounds: list[int]
 
     def __init__(
         self,
@@ -287,10 +288,7 @@ class Scene:
 
     def part_slice(self, part: int) -> slice:
         """Where in `pixels` the fragments of one part lie."""
-        return slice(
-            int(np.searchsorted(self.pixel_part, part, "left")),
-            int(np.searchsorted(self.pixel_part, part, "right")),
-        )
+        return slice(self._bounds[part], self._bounds[part + 1])
 
     def samples(self, index: NDArray[np.integer]) -> tuple[Int64, Int64, Float64]:
         """The samples of fragments (m,), one fragment after the other.
@@ -488,6 +486,7 @@ class Scene:
             views=-toward, _sample_part=part, offsets=offsets, pixels=pixel[first],
             pixel_part=part[first], bordering=bordering,
             weights=np.where(bordering, count / self.subsamples, 1.0), uncovered=missed,
+            _bounds=np.searchsorted(part[first], np.arange(len(self.parts) + 1)).tolist(),
         )  # fmt: skip
 
     def _shoot(self, origin: Float64, x: Float64, y: Float64) -> Hits:

@@ -7,7 +7,7 @@ table, I = W rho; `quadrature.Operator` knows the rows of W, shadows included.
 rows W_S of a subset S of fragments and training tables X, the SVD of the column-normalised
 W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables whose images W M span
 the frames; Q are the leading left singular vectors of W M Sigma. The three colours of a map light
-a shape much alike, so one Q serves them all: 100 columns err less than three times 64, and a frame
+a shape much alike, so one Q serves them all: 96 columns err less than three times 64, and a frame
 reads them once. Frame = Q (C rho), with a C for each colour. The orthogonal choice C = Q^T W needs
 every row; weighted least squares on some five times more rows than Q has columns comes within a
 third of its error, if half the fragments are drawn by their leverage in Q and half evenly, each
@@ -187,7 +187,7 @@ class Transport:
 
     TRAINING_ROWS = 320
     """Fragments of a group (S) on which the training tables are compared."""
-    TABLES = 5 / 7
+    TABLES = 5 / 6
     """Combinations of training tables for each basis image: their colours make up the rest."""
     FIT_FACTOR = 8
     """Rows of the least-squares fit for each basis image."""
@@ -201,7 +201,7 @@ class Transport:
         scene: Scene,
         grid: HalfDiffGrid,
         training: Training,
-        rank: int = 112,
+        rank: int = 96,
         resolution: float = 1.0,
         seed: int = 0,
         device: str | torch.device = "cpu",
@@ -601,20 +601,34 @@ class Transport:
         coefficients = _per_colour(basis.rows[:, : basis.rank], basis.at_cells(table))
         return basis.basis[known.span] @ coefficients.T
 
-    def _project(self, group: int, table: torch.Tensor) -> torch.Tensor:
-        """A table's coefficients and exact probes (3, r + m), in one product.
+    def _project(
+        self, part: _Part, table: torch.Tensor, alone: bool
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """A table's coefficients (3, r) and a part's exact probes (3, m).
 
-        The last is kept, since parts of one material follow each other.
+        One product has those of all parts, and the last is kept: parts of one material follow
+        each other. That of a part that is `alone` reads its own rows only.
         """
-        key = (group, table._version)
-        if not (self._projected and self._projected[0] is table and self._projected[1] == key):
-            basis = self.bases[group]
-            self._projected = (table, key, _per_colour(basis.rows, basis.at_cells(table)))
-        known: torch.Tensor = self._projected[2]
-        return known
+        basis = self.bases[part.group]
+        key = (part.group, table._version)
+        if self._projected and self._projected[0] is table and self._projected[1] == key:
+            known: torch.Tensor = self._projected[2]
+        elif alone:
+            columns = basis.at_cells(table)
+            probes = basis.rows[:, basis.rank :][:, part.exact]
+            coefficients = _per_colour(basis.rows[:, : basis.rank], columns)
+            return coefficients, _per_colour(probes, columns)
+        else:
+            known = _per_colour(basis.rows, basis.at_cells(table))
+            self._projected = (table, key, known)
+        return known[:, : basis.rank], known[:, basis.rank :][:, part.exact]
 
     def shade(
-        self, part: int, table: torch.Tensor, mirror: torch.Tensor | None = None
+        self,
+        part: int,
+        table: torch.Tensor,
+        mirror: torch.Tensor | None = None,
+        alone: bool = False,
     ) -> PartFrame:
         """Linear radiance of one part's fragments, and its error measured on the probes.
 
@@ -624,6 +638,7 @@ class Transport:
         table : (len(cells), 3) float32
             f_r at the cells that the scene sees.
         mirror : (3,) weight of a perfect mirror
+        alone : whether no other part is shaded with this table next: that reads less memory
         """
         self._check_table(table)
         known = self.parts[part]
@@ -631,9 +646,8 @@ class Transport:
             empty = torch.zeros((0, 3), device=self.device)
             return PartFrame(empty, 0.0, 0.0)
         basis = self.bases[known.group]
-        projected = self._project(known.group, table)
-        pixels = (basis.basis[known.span] @ projected[:, : basis.rank].T).clamp_min_(0.0)
-        exact = projected[:, basis.rank :][:, known.exact]
+        coefficients, exact = self._project(known, table, alone)
+        pixels = (basis.basis[known.span] @ coefficients.T).clamp_min_(0.0)
         found = torch.gather(pixels, 0, known.probes.T.expand(-1, 3)).T
         deviation = float((found - exact).abs().mean())
         level = float(exact.mean())
