@@ -400,6 +400,21 @@ class LightTree:
     rectangle: NDArray[np.int32]
 
     @cached_property
+    def packed(self) -> tuple[NDArray[Any], ...]:
+        """What a walk reads of a node, by how often: place and size (n, 8), irradiance (n, 12),
+        children (n, 2), -2 where the node is one texel, and rectangle (n, 4)."""
+        place = np.zeros((len(self.radius), 8), np.float32)
+        place[:, :3] = self.direction
+        place[:, 3] = self.radius
+        place[:, 4] = self.spread**2
+        moment = np.zeros((len(self.radius), 12), np.float32)
+        moment[:, :9] = self.moment.reshape(-1, 9)
+        box = self.rectangle
+        texel = (box[:, 1] - box[:, 0] == 1) & (box[:, 3] - box[:, 2] == 1)
+        child = np.where(texel[:, None], -2, self.child).astype(np.int32)
+        return place, moment, child, box
+
+    @cached_property
     def flux(self) -> NDArray[np.float64]:
         """(n,) length of each node's vector irradiance, all colours together."""
         red, green, blue = self.moment.astype(np.float64).transpose(1, 0, 2)

@@ -136,7 +136,7 @@ class Operator:
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
             tree = LightTree.build(environment)
         self.tree = tree
-        self._nodes = _pack(self.tree)
+        self._nodes = self.tree.packed
         self._image = environment.image
         scale = 1.0 / resolution
         # sharp lobes are lost where the leaves at their peaks grow wider than these
@@ -907,20 +907,6 @@ def _near_window(grid: HalfDiffGrid) -> Float32:
     """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 over `_SPLIT`."""
     t = np.clip((grid.theta_h - _SPLIT[0]) / (_SPLIT[1] - _SPLIT[0]), 0.0, 1.0)
     return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
-
-
-def _pack(tree: LightTree) -> tuple[NDArray[Any], ...]:
-    """What the walk reads of a node, by how often: place and size, irradiance, children."""
-    place = np.zeros((len(tree.radius), 8), np.float32)
-    place[:, :3] = tree.direction
-    place[:, 3] = tree.radius
-    place[:, 4] = tree.spread**2
-    moment = np.zeros((len(tree.radius), 12), np.float32)
-    moment[:, :9] = tree.moment.reshape(-1, 9)
-    box = tree.rectangle
-    texel = (box[:, 1] - box[:, 0] == 1) & (box[:, 3] - box[:, 2] == 1)
-    child = np.where(texel[:, None], -2, tree.child).astype(np.int32)
-    return place, moment, child, box
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
