@@ -329,7 +329,8 @@ def _shown(transport: Transport, tables: Sequence[TabulatedBRDF], index: Int64) 
         mine = np.flatnonzero((index >= span.start) & (index < span.stop))
         wrong = np.flatnonzero(refused[part])
         for some in np.array_split(wrong, math.ceil(len(wrong) / 16)) if len(wrong) else []:
-            images = transport.operator.part_images(part, _channels([tables[b] for b in some]))
+            own = _channels([tables[b] for b in some])
+            images = transport.operator.part_images(part, own, interpolate=False)
             exact = _own_colours(images[index[mine] - span.start])
             final[mine[:, None], some] = exact
     return _Shown(basis, final, measured, refused)
@@ -447,7 +448,7 @@ def _spread(errors: Float64) -> str:
 
 def family_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     """Families left out of training: are their frames' errors noticed, and what is shown then?"""
-    size, each, members = (40, 5, 4) if quick else (96, 120, 15)
+    size, each, members = (40, 5, 4) if quick else (512, 100, 12)
     library = default_library()
     grid = library.embedding.grid_
     families = LEFT_OUT[:1] if quick else LEFT_OUT

@@ -141,7 +141,13 @@ class Operator:
         scale = 1.0 / resolution
         # sharp lobes are lost where the leaves at their peaks grow wider than these
         rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
-        self._rules = np.stack([rule, rule * (1.6, 2.56, 1.6, 1.6)]).astype(np.float32)
+        border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
+        # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
+        # need leaves of half that size
+        exact = np.stack([rule, border])
+        exact[:, 0] = 0.5 * rule[0]
+        self._rules = np.stack([rule, border]).astype(np.float32)
+        self._exact_rules = exact.astype(np.float32)
         self._capacity = int(1600 * resolution**2) + 200
         to_map = scene.environment.to_map
         self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
@@ -231,7 +237,7 @@ class Operator:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             self._shade(
                 out, index, plan.mask_rows, _ALL, tables,
-                lambda fraction: report("exact images", fraction),
+                lambda fraction: report("exact images", fraction), exact=True,
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
@@ -314,7 +320,7 @@ class Operator:
             _first_rows(group_start, mask_rows[target]), several,
         )  # fmt: skip
 
-    def _light(self, window: tuple[float, float]) -> tuple[Any, ...]:
+    def _light(self, window: tuple[float, float], exact: bool) -> tuple[Any, ...]:
         """What the walk needs beside the samples: nodes, masks and rules."""
         low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
         cut, masks = _NO_CUT, _NO_MASKS
@@ -322,7 +328,7 @@ class Operator:
             cut = (self._visibility.cut.first, self._visibility.cut.last)
             masks = self._visibility.masks
         return (
-            *self._nodes, self._image, *cut, *masks, self._rules,
+            *self._nodes, self._image, *cut, *masks, self._exact_rules if exact else self._rules,
             f32(low), f32(high if high < 1.0 else 9.0), f32(math.sin(_OUTLINE)),
         )  # fmt: skip
 
@@ -335,15 +341,17 @@ class Operator:
         tables: Float32,
         report: Callable[[float], None] = lambda fraction: None,
         place: Int64 | None = None,
+        exact: bool = False,
     ) -> None:
         """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
         `tables` (cells, T), or to their rows if there are no tables.
 
         `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
-        `place` (m,) says where in `out` each fragment is; those of -1 are left out.
+        `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
+        leaves for sharp lobes.
         """
         step = 1 << 13
-        light = self._light(window)
+        light = self._light(window, exact or self.resolution > 1.0)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
