@@ -144,10 +144,9 @@ class Operator:
         border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
         # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
         # need leaves of half that size
-        exact = np.stack([rule, border])
-        exact[:, 0] = 0.5 * rule[0]
+        fine = border * (0.5 / 1.6, 1.0, 1.0, 1.0)
         self._rules = np.stack([rule, border]).astype(np.float32)
-        self._exact_rules = exact.astype(np.float32)
+        self._exact_rules = np.stack([rule, fine]).astype(np.float32)
         self._capacity = int(1600 * resolution**2) + 200
         to_map = scene.environment.to_map
         self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
@@ -163,7 +162,7 @@ class Operator:
 
     # -- single fragments -----------------------------------------------------------------------
 
-    def rows(self, index: NDArray[np.integer], interpolate: bool = False) -> Float32:
+    def rows(self, index: NDArray[np.integer]) -> Float32:
         """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
@@ -359,12 +358,17 @@ class Operator:
             bundles, target = self._bundles(index[at], mask_rows[at]), out[at]
             if place is not None:
                 bundles, target = bundles.of(place[at]), out
-            capacity = self._capacity
-            while len(bundles.several):
-                short = self._shade_some(target, bundles, light, tables, capacity)
-                bundles = bundles.take(short)
-                capacity *= 2
+            self._shade_all(target, bundles, light, tables)
             report(at.stop / len(index))
+
+    def _shade_all(
+        self, out: Float32, bundles: _Bundles, light: tuple[Any, ...], tables: Float32
+    ) -> None:
+        """Shade bundles, those again that have more leaves than there was room for."""
+        capacity = self._capacity
+        while len(bundles.several):
+            bundles = bundles.take(self._shade_some(out, bundles, light, tables, capacity))
+            capacity *= 2
 
     def _shade_some(
         self,
@@ -390,9 +394,7 @@ class Operator:
         again &= ~shared
         if shared.any():
             apart = bundles.take(shared).separated()
-            while len(apart.several):
-                apart = apart.take(self._shade_some(out, apart, light, tables, capacity))
-                capacity *= 2
+            self._shade_all(out, apart, light, tables)
         if again.any():
             local, which = _questions(ask[again], asked[again])
             toward = turn_about_y(local, self.scene.environment.rotation)
@@ -454,10 +456,11 @@ class Operator:
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
         """Cast a part's rays and find where its far images are computed, if that is not done."""
-        self._plan(part, *([progress] if progress else []))
+        self._plan(part, progress)
 
-    def _plan(self, part: int, report: Progress = lambda stage, fraction: None) -> _Plan:
+    def _plan(self, part: int, progress: Progress | None = None) -> _Plan:
         if part not in self._plans:
+            report = progress or (lambda stage, fraction: None)
             loose = max(1.0, 1.0 / self.resolution)
             self._plans[part] = _Plan.make(self.scene, part, self._visibility, loose, report)
         return self._plans[part]

@@ -73,6 +73,16 @@ class _Basis:
     def rank(self) -> int:
         return self.basis.shape[-1]
 
+    @property
+    def projection(self) -> torch.Tensor:
+        """(C, r, n) a table's coefficients."""
+        return self.rows[:, : self.rank]
+
+    @property
+    def probes(self) -> torch.Tensor:
+        """(C, m, n) exact rows of the probes."""
+        return self.rows[:, self.rank :]
+
     def at_cells(self, table: torch.Tensor) -> torch.Tensor:
         """(3, n) of a table (len(Transport.cells), 3)."""
         return (table if self.place is None else table[self.place]).T.contiguous()
@@ -483,9 +493,9 @@ class Transport:
         fresh = torch.zeros((len(basis), 3))
         fresh[mine.span] = radiance.cpu() * damping[mine.span, None]
         basis = _extended(basis, fresh)
-        exact = np.zeros((*known.rows[:, known.rank :].shape[:2], self.grid.size), np.float32)
+        exact = np.zeros((*known.probes.shape[:2], self.grid.size), np.float32)
         cells = known.cells.cpu().numpy()
-        exact[:, :, cells] = known.rows[:, known.rank :].cpu().numpy()
+        exact[:, :, cells] = known.probes.cpu().numpy()
         rng = np.random.default_rng(basis.shape[-1])
         self.bases[mine.group] = self._assemble(known.parts, basis, damping, exact, rng)
         self._join_cells()
@@ -598,7 +608,7 @@ class Transport:
         if known is None:
             return torch.zeros((0, 3), device=self.device)
         basis = self.bases[known.group]
-        coefficients = _per_colour(basis.rows[:, : basis.rank], basis.at_cells(table))
+        coefficients = _per_colour(basis.projection, basis.at_cells(table))
         return basis.basis[known.span] @ coefficients.T
 
     def _project(
@@ -615,9 +625,8 @@ class Transport:
             known: torch.Tensor = self._projected[2]
         elif alone:
             columns = basis.at_cells(table)
-            probes = basis.rows[:, basis.rank :][:, part.exact]
-            coefficients = _per_colour(basis.rows[:, : basis.rank], columns)
-            return coefficients, _per_colour(probes, columns)
+            exact = _per_colour(basis.probes[:, part.exact], columns)
+            return _per_colour(basis.projection, columns), exact
         else:
             known = _per_colour(basis.rows, basis.at_cells(table))
             self._projected = (table, key, known)
@@ -679,8 +688,7 @@ class Transport:
             return PartFrame(radiance, 0.0, 0.0)
         seen = torch.from_numpy(table[self.cells]).to(self.device)
         basis = self.bases[known.group]
-        rows = basis.rows[:, basis.rank :][:, known.exact]
-        exact = _per_colour(rows, basis.at_cells(seen))
+        exact = _per_colour(basis.probes[:, known.exact], basis.at_cells(seen))
         found = torch.gather(radiance.T, 1, known.probes.expand(3, -1))
         if mirror is not None:
             radiance = radiance + mirror * known.mirror
