@@ -48,10 +48,12 @@ def prepared(small_teapot, training):
 
 @pytest.fixture(scope="module")
 def prepared_ball(training):
-    """A ball on the ground, in few pixels, prepared."""
+    """A ball on the ground, in few pixels, prepared for edits of both."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(editing, "_training", lambda library, seed: training)
-        return EditSession(ball_scene(), quality="preview").prepare()
+        session = EditSession(ball_scene(), quality="preview")
+        session.move("ground", bright=0.1)
+        return session.prepare()
 
 
 def ball_scene(size=20, **arguments):
@@ -64,7 +66,7 @@ def over(transport, **arguments):
     session = EditSession(transport.scene, quality="preview", **arguments)
     again = Transport.restored(transport.scene, transport.grid, transport.arrays())
     again._operator = transport._operator  # the rays are cast once
-    session._view.transport = again
+    session._view.prepared = editing._Prepared(again, False, {})
     return session
 
 
@@ -669,6 +671,99 @@ def test_the_report_says_what_was_left_out(prepared_ball):
     assert session.report()["left_out"]["channels"]["computed"] == 1
 
 
+# -- a ground that nobody edits ----------------------------------------------------------------
+
+
+def test_a_ground_that_nobody_edits_is_prepared_for_its_material(prepared_ball):
+    session = EditSession(ball_scene(), "preview", cache=False)
+    frame = session.render()
+    report = session.report()
+    left = report["left_out"]["edits"]
+    assert left["parts"] == ["ground"]
+    assert 0 < left["basis_images"] < left["of"]
+    assert report["parts"]["ground"]["tier"] == "basis"
+    assert report["parts"]["ground"]["error"] < 0.01
+    full = over(prepared_ball, error=1.0).render()
+    assert np.abs(frame - full).mean() < 0.01 * full.mean()
+    # edits of the rest need nothing more
+    session.move("sphere", shiny=0.4)
+    assert session.ready
+
+
+def test_the_first_edit_of_the_ground_has_it_prepared_for_all(prepared_ball):
+    session = EditSession(ball_scene(), "preview", cache=False)
+    before = session.render()
+    transport = session.prepare()
+    session.move("ground", shiny=0.5, bright=-0.3)
+    assert not session.ready
+    shown = session.render()
+    assert session.ready
+    assert session.prepare() is not transport
+    assert session.report()["left_out"]["edits"] == {"parts": [], "basis_images": 0, "of": 40}
+    other = over(prepared_ball, error=1.0)
+    other.move("ground", shiny=0.5, bright=-0.3)
+    np.testing.assert_allclose(shown, other.render(), rtol=0.02, atol=1e-3)
+    # the ball is shown from what was there before
+    free = session.prepare()
+    assert free.bases[0].basis is transport.bases[0].basis
+    session.undo()
+    assert session.ready
+    same(session.render(), before)
+    # the next view is prepared for such edits from the start
+    session.look(rotation=0.5)
+    session.prepare()
+    session.move("ground", shiny=0.2)
+    assert session.ready
+
+
+def test_a_ground_is_prepared_for_what_it_was_assigned():
+    session = EditSession(ball_scene(12), "preview", cache=False)
+    session.assign("ground", "blue-plastic")
+    session.prepare()
+    assert session.prepare().fixed == {1}
+    session.assign("ground", "chalk" if "chalk" in LIBRARY else "gold-satin")
+    assert not session.ready
+    assert session.prepare().fixed == frozenset()
+
+
+def test_gradients_of_a_ground_have_it_prepared_for_all():
+    session = EditSession(ball_scene(12), "preview", cache=False)
+    session.prepare()
+    session.gradient("ground")
+    assert session.prepare().fixed == frozenset()
+
+
+def test_an_edit_of_the_ground_while_it_is_prepared(gate):
+    """What ends then is not enough: the frame waits for the rest."""
+    session = EditSession(ball_scene(12), "preview", progress=gate, cache=False)
+    session.prepare(wait=False)
+    assert gate.reached.wait(60.0)
+    session.move("ground", shiny=0.4)
+    gate.opened.set()
+    session.render()
+    assert session.prepare().fixed == frozenset()
+
+
+def test_cached_grounds(cache):
+    first = EditSession(ball_scene(12), "preview")
+    plain = first.render()
+    written()
+    second = EditSession(ball_scene(12), "preview")
+    same(second.render(), plain)
+    assert second.report()["prepared_from"] == "cache"
+    assert second.prepare().fixed == {1}
+    second.move("ground", shiny=0.4)
+    moved = second.render()
+    written()
+    third = EditSession(ball_scene(12), "preview")
+    third.render()
+    # the one for all edits serves this as well
+    assert third.report()["prepared_from"] == "cache"
+    assert third.prepare().fixed == frozenset()
+    third.move("ground", shiny=0.4)
+    same(third.render(), moved)
+
+
 # -- ground, shadows, older files -------------------------------------------------------------
 
 
@@ -687,7 +782,7 @@ def test_a_design_keeps_ground_shadows_and_texture_coordinates(tmp_path, trainin
     same(again.scene.shape.uvs, mesh.uvs)
     same(again.scene.weights, scene.weights)
     # so that what was prepared for it is found again
-    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0) for s in (session, again)]
+    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0, {}) for s in (session, again)]
     assert keys[0] == keys[1]
 
 
@@ -1131,7 +1226,7 @@ def test_a_preparation_that_ends_after_the_look_is_not_shown(gate):
     session.look(rotation=2.0)
     gate.opened.set()
     ended(job)
-    assert old.transport is not None
+    assert old.prepared is not None
     assert not session.ready
     assert session.prepare().scene is session.scene
 
@@ -1194,7 +1289,7 @@ def test_a_session_that_is_gone_is_not_prepared(gate):
     del session
     gate.opened.set()
     ended(job)
-    assert view.transport is None
+    assert view.prepared is None
 
 
 @pytest.mark.parametrize("when", ["at once", "at work"])
@@ -1363,8 +1458,8 @@ def test_a_key_names_all_that_a_preparation_depends_on():
     light = tb.PointLight((3.0, 3.0, 3.0))
     scene = ball_scene(lights=[light])
 
-    def key(scene=scene, library=LIBRARY, rank=24, resolution=0.7, seed=0):
-        return editing._cache_key(scene, library, rank, resolution, seed)
+    def key(scene=scene, library=LIBRARY, rank=24, resolution=0.7, seed=0, fixed=None):
+        return editing._cache_key(scene, library, rank, resolution, seed, fixed or {})
 
     other = tb.Library(EMBEDDING, LIBRARY.names, LIBRARY.coordinates * 0.99, LIBRARY.families)
     pot = tb.Scene(tb.teapot(), scene.environment, size=8)
@@ -1376,6 +1471,9 @@ def test_a_key_names_all_that_a_preparation_depends_on():
         key(rank=25),
         key(resolution=0.8),
         key(seed=1),
+        key(fixed={1: np.zeros((4, 3), np.float32)}),
+        key(fixed={1: np.ones((4, 3), np.float32)}),
+        key(fixed={0: np.ones((4, 3), np.float32)}),
         key(library=other),
         key(scene.changed(size=21)),
         key(scene.changed(camera=tb.Camera.orbit(20.0, 26.0))),
@@ -1412,7 +1510,7 @@ def test_a_shape_that_only_knows_itself_is_not_cached(cache):
             return self._shape.occluded(origins, directions, max_distance)
 
     scene = tb.Scene(Own(), tb.EnvironmentMap.sky(rows=16), size=8)
-    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0) is None
+    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0, {}) is None
     EditSession(scene, "preview").prepare()
     written()
     assert not cache.exists()
@@ -1738,9 +1836,10 @@ def test_a_graphics_card_shows_the_same(prepared_ball):
     frames, slopes = [], []
     for device in ("cpu", "cuda"):
         session = EditSession(prepared_ball.scene, "preview", device=device)
-        session._view.transport = Transport.restored(
+        known = Transport.restored(
             prepared_ball.scene, EMBEDDING.grid_, prepared_ball.arrays(), device
         )
+        session._view.prepared = editing._Prepared(known, False, {})
         session.assign("sphere", "gold-satin")
         session.render()
         session.assign("sphere", PerfectMirror(0.3) + Lambert(0.4))

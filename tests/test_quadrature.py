@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from traitbrdf import reference
+from traitbrdf import quadrature, reference
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.directions import reflect
 from traitbrdf.embedding import GRID, default_library
@@ -634,3 +634,48 @@ def test_a_light_tree_at_hand_is_used(shape, small_sphere):
     operator = Operator(scene, GRID, tree=other.tree)
     assert operator.tree is other.tree
     np.testing.assert_array_equal(operator.rows(index), other.rows(index))
+
+
+# -- as fine as a scene requires --------------------------------------------------------------
+
+
+def test_lobes_as_wide_as_their_tables_are(small_sphere):
+    angles = GRID.theta_h[:, None, None, None]
+    for width in (0.05, 0.2):
+        inside = 2.0 - np.clip(angles - width, 0.0, 1.0) + np.zeros((*GRID.shape, 1))
+        found = quadrature._lobe(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
+        # within it they change by no more than is allowed
+        assert width <= found <= width + 1.2 * quadrature._FLAT * 2.0
+    assert quadrature._lobe(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
+    noise = np.random.default_rng(0).random((GRID.size, 2), dtype=np.float32)
+    assert quadrature._lobe(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
+
+
+def test_what_views_never_see_does_not_narrow_lobes():
+    table = np.ones((*GRID.shape, 1), np.float32)
+    table[:3, GRID.theta_d > 1.4] = 100.0
+    assert quadrature._lobe(GRID, table.reshape(-1, 1), 1.5) < 0.01
+    assert quadrature._lobe(GRID, table.reshape(-1, 1), 0.9) > 1.5
+
+
+def test_wide_lobes_have_far_images_alone():
+    """Nothing is told as near, there are fewer leaves, and the picture is as right as before."""
+    scene = ball_on_ground()
+    operator = Operator(scene, GRID)
+    for part in range(2):
+        told: list[str] = []
+        tell = functools.partial(lambda told, stage, fraction: told.append(stage), told)
+        wide = operator.part_images(part, GREY, tell)
+        assert "far images" in told and "near images" not in told
+        span = scene.part_slice(part)
+        some = np.arange(span.start, span.stop, 7)
+        exact = Operator(scene, GRID, 2.0, operator.tree).images(some, GREY)
+        error = np.abs(wide[some - span.start] - exact).mean() / exact.mean()
+        assert error < 0.01, part
+
+
+def test_flat_parts_interpolate_narrower_lobes():
+    operator = Operator(ball_on_ground(96), GRID)
+    operator.prepare(0)
+    operator.prepare(1)
+    assert operator._plans[1].scale < operator._plans[0].scale <= 1.0

@@ -395,6 +395,62 @@ def test_odd_arrays_are_refused(built, on_ground):
     refused(lambda arrays: None, known=on_ground, scene=built.scene)
 
 
+# -- fixed parts ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fixed(on_ground, training):
+    ground = flat(LIBRARY["concrete"])
+    return Transport(on_ground.scene, GRID, training, rank=24, fixed={1: ground})
+
+
+def test_a_fixed_part_is_shown_in_its_material(fixed, on_ground):
+    assert (fixed.fixed, on_ground.fixed) == ({1}, frozenset())
+    assert fixed.bases[1].rank <= 9 < on_ground.bases[1].rank
+    table = LIBRARY["concrete"]
+    (exact,) = exactly(fixed, [table], part=1)
+    frame = shade(fixed, table, part=1)
+    assert relative(frame, exact) < 0.01
+    assert frame.error < 0.01
+
+
+def test_another_material_on_a_fixed_part_is_noticed(fixed):
+    for name in ("chrome", "blue-plastic", "gold-satin"):
+        assert shade(fixed, LIBRARY[name], part=1).error > 0.03, name
+
+
+def test_a_freed_transport_is_that_without_fixed_parts(fixed, on_ground, training):
+    before = fixed.arrays()
+    told = []
+    free = fixed.freed(training, progress=lambda stage, fraction: told.append(fraction))
+    assert told
+    expected = on_ground.arrays()
+    for name, value in free.arrays().items():
+        if name.endswith("_0"):  # the shape's: those of the same rays
+            np.testing.assert_array_equal(value, before[name], err_msg=name)
+        else:
+            np.testing.assert_array_equal(value, expected[name], err_msg=name)
+    assert free.bases[0].basis is fixed.bases[0].basis
+    for name, value in fixed.arrays().items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+def test_a_restored_transport_can_be_freed(fixed, on_ground, training):
+    again = Transport.restored(fixed.scene, GRID, fixed.arrays())
+    assert again.fixed == {1}
+    free = again.freed(training)
+    for name, value in free.arrays().items():
+        if name.endswith("_1"):
+            np.testing.assert_array_equal(value, on_ground.arrays()[name], err_msg=name)
+
+
+def test_odd_fixed_tables_are_refused(fixed, training):
+    table = flat(LIBRARY["concrete"])
+    for odd in ({2: table}, {-1: table}, {1: table[:, :2]}, {1: table[:-1]}):
+        with pytest.raises(ValueError, match="fixed"):
+            Transport(fixed.scene, GRID, training, rank=8, fixed=odd)
+
+
 # -- training ---------------------------------------------------------------------------------
 
 

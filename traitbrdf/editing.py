@@ -94,7 +94,7 @@ CACHE_BYTES = 2_000_000_000
 """Preparations on disk take at most so many bytes, unless TRAITBRDF_CACHE_BYTES says otherwise."""
 
 _FORMAT = 2
-_CACHE_FORMAT = 1
+_CACHE_FORMAT = 2
 _FIRST_MATERIAL = "white-plastic"
 _FIRST_GROUND = "concrete"
 _TICK = 0.2  # seconds between two looks at how far a preparation has come
@@ -237,6 +237,16 @@ class _LightTrees:
             return self._tree
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """A transport, whether it came from the cache, and the materials of the parts that it was
+    prepared for no others of (by index)."""
+
+    transport: Transport
+    cached: bool
+    fixed: Mapping[int, Material]
+
+
 class _Preparation:
     """One run of a view's preparation, in whatever thread calls `run`.
 
@@ -251,8 +261,8 @@ class _Preparation:
 
     def __init__(
         self,
-        work: Callable[[Progress], tuple[Transport, bool]],
-        publish: Callable[[_Preparation, Transport, bool], None],
+        work: Callable[[Progress], _Prepared],
+        publish: Callable[[_Preparation, _Prepared], None],
         progress: Progress | None,
         wanted: Callable[[], object],
     ) -> None:
@@ -288,11 +298,11 @@ class _Preparation:
         try:
             self._take()
             try:
-                transport, cached = self._work(self._told)
+                prepared = self._work(self._told)
             finally:
                 _TURNS.give(self)
             self.seconds = time.perf_counter() - start
-            self._publish(self, transport, cached)
+            self._publish(self, prepared)
         except _StopError:
             pass
         except BaseException as error:  # also an interruption: whoever waits raises it
@@ -414,8 +424,7 @@ class _View:
 
     scene: Scene
     job: _Preparation | None = None
-    transport: Transport | None = None
-    cached: bool = False
+    prepared: _Prepared | None = None
     canvas: _Canvas | None = None
     shown: list[_Shown] = field(default_factory=list)
     kept: OrderedDict[tuple[int, Material], _Shown] = field(default_factory=OrderedDict)
@@ -504,6 +513,7 @@ class EditSession:
         self._trees = _LightTrees()
         self._lock = threading.RLock()
         self._view = _View(scene)
+        self._edited: set[str] = set()  # parts that a preparation has to serve all edits of
         first = self._first(_FIRST_MATERIAL)
         self._materials = dict.fromkeys(scene.parts, first)
         if scene.ground:
@@ -634,6 +644,7 @@ class EditSession:
             moved = {m: self._moved(m, amounts, hold) for m in map(self.material, names)}
             new = {name: moved[self.material(name)] for name in names}
             target = part if isinstance(part, str) else names
+            self._edited.update(new)
             self._do(new, _Said(_move_call(target, amounts, hold)))
 
     def _moved(self, old: Material, amounts: Mapping[str, float], hold: Iterable[str]) -> Material:
@@ -685,6 +696,7 @@ class EditSession:
                 for name, amount in moved.items()
             }
             held = "" if stroke.hold is None else f", hold={hold!r}"
+            self._edited.update(new)
             self._do(new, _Said(
                 f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
                 f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}))",
@@ -793,7 +805,18 @@ class EditSession:
     @property
     def ready(self) -> bool:
         """Whether the present view is prepared: `render` then takes milliseconds."""
-        return self._view.transport is not None
+        return self._serving(self._view) is not None
+
+    def _serving(self, view: _View) -> Transport | None:
+        """The view's transport, if it is prepared and can show the present materials."""
+        known = view.prepared
+        if known is None:
+            return None
+        for index, material in known.fixed.items():
+            part = view.scene.parts[index]
+            if part in self._edited or self._materials[part] is not material:
+                return None
+        return known.transport
 
     @overload
     def prepare(self, wait: Literal[True] = True) -> Transport: ...
@@ -803,6 +826,9 @@ class EditSession:
 
     def prepare(self, wait: bool = True) -> Transport | None:
         """Compress the scene's light transport, unless that is done already.
+
+        A ground that nobody edits is prepared for its material alone; the first edit of it has
+        the rest done.
 
         Parameters
         ----------
@@ -825,8 +851,9 @@ class EditSession:
         while True:
             with self._lock:
                 view, job = self._view, self._view.job
-                if view.transport is not None:
-                    return view.transport
+                transport = self._serving(view)
+                if transport is not None:
+                    return transport
                 fresh = job is None
                 if job is None:
                     job = view.job = self._new_job(view)
@@ -846,24 +873,30 @@ class EditSession:
             if job.thread is threading.current_thread() and not job.done.is_set():
                 raise RuntimeError("prepare: expected another thread than that of the preparation")
             job.done.wait()
-            if job.stopped and self._view is view and view.transport is None:
+            if job.stopped and self._view is view and self._serving(view) is None:
                 raise CancelledError("the preparation was cancelled")
 
     def _new_job(self, view: _View) -> _Preparation:
         # neither of these holds the session: a session that nobody needs any more can go
         lock = self._lock
 
-        def publish(job: _Preparation, transport: Transport, cached: bool) -> None:
+        def publish(job: _Preparation, prepared: _Prepared) -> None:
             with lock:
-                if view.transport is None:
-                    view.transport, view.cached = transport, cached
+                known = view.prepared
+                if known is None or len(known.fixed) > len(prepared.fixed):
+                    view.prepared, view.canvas = prepared, None
                     view.times["prepare"] = job.seconds
                 if view.job is job:
                     view.job = None
 
+        scene, fixed = view.scene, {}
+        if scene.ground and scene.parts[-1] not in self._edited and view.prepared is None:
+            fixed[len(scene.parts) - 1] = self._materials[scene.parts[-1]]
+        known = None if view.prepared is None else view.prepared.transport
         work = functools.partial(
-            _prepare, view.scene, self.library, self.quality, self.seed, self.device, self._cache
-        )
+            _prepare, scene, self.library, self.quality, self.seed, self.device, self._cache,
+            fixed, known,
+        )  # fmt: skip
         return _Preparation(work, publish, self._progress, weakref.ref(self))
 
     def cancel(self) -> None:
@@ -931,8 +964,9 @@ class EditSession:
         while not wait:
             with self._lock:
                 view = self._view
-                if view.transport is not None:
-                    return self._frame(view, view.transport)
+                transport = self._serving(view)
+                if transport is not None:
+                    return self._frame(view, transport)
             image, _ = self.draft()
             if self.prepare(wait=False) is None:
                 return image
@@ -980,8 +1014,9 @@ class EditSession:
             self.prepare()
             with self._lock:
                 view = self._view
-                if view.transport is not None:
-                    yield view, view.transport
+                transport = self._serving(view)
+                if transport is not None:
+                    yield view, transport
                     return
 
     def _frame(self, view: _View, transport: Transport) -> Float32:
@@ -1089,6 +1124,7 @@ class EditSession:
         an assigned table has beyond the manifold, and a mirror beside it, stay.
         """
         index, material = self.part(part), self.material(part)
+        self._edited.add(part)
         with self._prepared() as (_, transport):
             table = self.embedding.decode_tensor(z, material.offset, transport.cells)
             shown = transport.radiance(index, table.to(self.device, torch.float32))
@@ -1110,6 +1146,7 @@ class EditSession:
             present coordinates.
         """
         index, material = self.part(part), self.material(part)
+        self._edited.add(part)
         with self._prepared() as (view, transport):
             slopes = self.embedding.jacobian(material.z, material.offset, transport.cells)
             columns = torch.from_numpy(slopes).to(self.device).permute(2, 0, 1)
@@ -1148,12 +1185,13 @@ class EditSession:
             parts = {}
             for i, (part, material) in enumerate(zip(scene.parts, materials, strict=True)):
                 parts[part] = self._part_report(part, material, view.shown[i])
+            prepared = view.prepared
             return {
                 "quality": self.quality,
                 "frame_error": _measured(view, transport),
                 "error_asked": EXACT_ABOVE if self.error is None else self.error,
                 "seconds": dict(view.times),
-                "prepared_from": "cache" if view.cached else "scratch",
+                "prepared_from": "cache" if prepared is not None and prepared.cached else "scratch",
                 "image": [scene.height, scene.width],
                 "covered_pixels": int(np.count_nonzero(scene.uncovered < 1.0)),
                 "fragments": len(scene.pixels),
@@ -1210,6 +1248,14 @@ class EditSession:
                     lambda: plain.values(self.embedding, transport.cells), self.device
                 ),
                 "seconds_for_all": _timed(lambda: plain.values(self.embedding), self.device),
+            },
+            "edits": {  # that nobody has made: they would need all of the basis images
+                "parts": [scene.parts[i] for i in sorted(transport.fixed)],
+                "basis_images": min(
+                    (b.rank for b in transport.bases if transport.fixed.intersection(b.parts)),
+                    default=0,
+                ),
+                "of": transport.rank,
             },
             "channels": {"computed": 1 if transport.grey else 3, "of": 3},
             "parts_not_edited": {
@@ -1445,29 +1491,41 @@ def _prepare(
     seed: int,
     device: torch.device,
     cache: _Cache | None,
+    fixed: Mapping[int, Material],
+    known: Transport | None,
     report: Progress,
-) -> tuple[Transport, bool]:
-    """The transport of a scene, and whether it came from the cache."""
+) -> _Prepared:
+    """The transport of a scene, for edits of all parts but those that are `fixed`; what is
+    `known` of it need not be computed again."""
     rank, resolution = QUALITIES[quality]
     grid = library.embedding.grid_
-    key = None if cache is None else _cache_key(scene, library, rank, resolution, seed)
-    if cache is not None and key is not None:
-        arrays = cache.read(key)
-        if arrays is not None:
+    tables = {part: material.values(library.embedding) for part, material in fixed.items()}
+    key = None
+    if cache is not None:
+        # one that serves all edits serves these as well
+        for some in ({}, fixed) if fixed else ({},):
+            used = {part: tables[part] for part in some}
+            key = _cache_key(scene, library, rank, resolution, seed, used)
+            arrays = None if key is None else cache.read(key)
+            if key is None or arrays is None:
+                continue
             try:
                 transport = Transport.restored(scene, grid, arrays, device)
             except ValueError:  # written by something else
                 cache.drop(key)
             else:
                 report("reading", 1.0)
-                return transport, True
+                return _Prepared(transport, True, some)
     report("tables", 0.0)
     training = _training(library, seed)
     report("tables", 0.0)
-    transport = Transport(scene, grid, training, rank, resolution, seed, device, report)
+    if known is None:
+        transport = Transport(scene, grid, training, rank, resolution, seed, device, report, tables)
+    else:
+        transport = known.freed(training, seed, report)
     if cache is not None and key is not None:
         cache.write_behind(key, transport.arrays())
-    return transport, False
+    return _Prepared(transport, False, fixed)
 
 
 @functools.lru_cache(maxsize=1)
@@ -1509,7 +1567,12 @@ def _code() -> str:
 
 
 def _cache_key(
-    scene: Scene, library: Library, rank: int, resolution: float, seed: int
+    scene: Scene,
+    library: Library,
+    rank: int,
+    resolution: float,
+    seed: int,
+    fixed: Mapping[int, Float32],
 ) -> str | None:
     """A name of all that a preparation depends on; None where that cannot be told."""
     shape = scene.shape
@@ -1522,7 +1585,8 @@ def _cache_key(
         return None  # what casts shadows is known to the shape alone
     return _hash(
         _CACHE_FORMAT, _code(), _fingerprint(library.embedding), library.coordinates,
-        rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
+        rank, resolution, seed, *(x for pair in fixed.items() for x in pair),
+        scene.height, scene.width, scene.parts, scene.casts,
         scene.ground, scene.shadows, np.asarray(shape.center), shape.radius, shape.lowest,
         *geometry, scene.environment.image, scene.environment.rotation, scene.lights,
         *(getattr(scene, name) for name in _FRAGMENTS),

@@ -47,7 +47,13 @@ Progress = Callable[[str, float], None]
 """Called with what is being done and the fraction done; may raise to cancel."""
 
 _SPLIT = (0.15, 0.35)
-"""theta_h in radians between which the window passes from near to far."""
+"""theta_h in radians between which the window passes from near to far, at a scale of 1."""
+_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
+"""How much less a part may bend than `_BEND` for far images to begin nearer."""
+_KEPT = 0.9
+"""Share of the fragments with interpolated far images that must remain so at such a scale."""
+_FLAT = 0.03
+"""How much of their largest value tables may change within the width of their lobes."""
 _OUTLINE = 0.03
 """theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
 _LEVELS = (4, 2)
@@ -55,7 +61,8 @@ _LEVELS = (4, 2)
 _CUT = (0.09, 1 / 500)
 """Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
 _BEND = (0.003, 0.06)
-"""Most that a normal departs from its cell's corners': from their mean, and from any."""
+"""Most that a half vector departs, seen against the normal, from those of its cell's corners:
+from their mean, and from any."""
 _UNEVEN = 0.02
 """Most that a cell's corners differ in what light they see: see `_disagreement`."""
 _QUESTIONS = 192
@@ -223,7 +230,8 @@ class Operator:
         """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
 
         Shadows are interpolated where rays agree, and far images where that is safe, unless
-        `interpolate` is False: an order of magnitude faster than `images`.
+        `interpolate` is False: an order of magnitude faster than `images`. Lobes that are wide
+        for the part have nothing but far images, and no leaves finer than they need.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
@@ -232,29 +240,34 @@ class Operator:
         if len(index) == 0:
             return np.zeros((0, 3, tables.shape[1]), np.float32)
         plan = self._plan(part, report)
-        if not interpolate:
+        # narrower lobes are interpolated where neighbouring pixels differ less
+        nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
+        low, high = (float(self.grid.theta_h[node]) for node in nodes)
+        lobe = _lobe(self.grid, tables, plan.grazing)
+        broad = lobe >= high  # nothing is near
+        if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             self._shade(
                 out, index, plan.mask_rows, _ALL, tables,
-                lambda fraction: report("exact images", fraction), exact=True,
+                lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
-        near = np.repeat(_near_window(self.grid), self.grid.shape[1] * self.grid.shape[2])
-        wide = tables * (1.0 - near)[:, None]
-        narrow = tables * near[:, None]
+        near = np.repeat(_near_window(self.grid, low, high), self.grid.size // self.grid.shape[0])
+        wide, far = (tables, _ALL) if broad else (tables * (1.0 - near)[:, None], (low, 9.0))
         coarse = np.zeros((len(plan.computed), 3, tables.shape[1]), np.float32)
         computed = index[plan.computed]
         self._shade(
-            coarse, computed, self._own_rows(computed), (_SPLIT[0], 9.0), wide,
-            lambda fraction: report("far images", fraction),
+            coarse, computed, self._own_rows(computed), far, wide,
+            lambda fraction: report("far images", fraction), lobe=lobe,
         )  # fmt: skip
         out = np.empty((len(index), 3, tables.shape[1]), np.float32)
         _interpolate(out, coarse, plan.corners, plan.weights)
-        self._shade(
-            out, index, plan.mask_rows, (-1.0, _SPLIT[1]), narrow,
-            lambda fraction: report("near images", fraction),
-        )  # fmt: skip
+        if not broad:
+            self._shade(
+                out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
+                lambda fraction: report("near images", fraction), lobe=lobe,
+            )  # fmt: skip
         self._add_lights(out, index, tables)
         return out
 
@@ -319,7 +332,7 @@ class Operator:
             _first_rows(group_start, mask_rows[target]), several,
         )  # fmt: skip
 
-    def _light(self, window: tuple[float, float], exact: bool) -> tuple[Any, ...]:
+    def _light(self, window: tuple[float, float], exact: bool, lobe: float) -> tuple[Any, ...]:
         """What the walk needs beside the samples: nodes, masks and rules."""
         low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
         cut, masks = _NO_CUT, _NO_MASKS
@@ -328,7 +341,8 @@ class Operator:
             masks = self._visibility.masks
         return (
             *self._nodes, self._image, *cut, *masks, self._exact_rules if exact else self._rules,
-            f32(low), f32(high if high < 1.0 else 9.0), f32(math.sin(_OUTLINE)),
+            f32(low), f32(high if high < 1.0 else 9.0),
+            f32(math.sin(_OUTLINE) if lobe <= _SPLIT[1] else -9.0), f32(math.sin(lobe)),
         )  # fmt: skip
 
     def _shade(
@@ -341,16 +355,17 @@ class Operator:
         report: Callable[[float], None] = lambda fraction: None,
         place: Int64 | None = None,
         exact: bool = False,
+        lobe: float = 0.0,
     ) -> None:
         """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
         `tables` (cells, T), or to their rows if there are no tables.
 
         `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
         `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
-        leaves for sharp lobes.
+        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need.
         """
         step = 1 << 13
-        light = self._light(window, exact or self.resolution > 1.0)
+        light = self._light(window, exact or self.resolution > 1.0, lobe)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
@@ -683,12 +698,16 @@ class _Plan:
     corners : (P, 4) int32 indices into `computed`
     weights : (P, 4) float32
     mask_rows : (P, 4) int32 visibility rows around each fragment, -1 for none
+    scale : of `_SPLIT` and `_BEND`
+    grazing : the largest angle of a view from its normal, in radians
     """
 
     computed: Int64
     corners: NDArray[np.int32]
     weights: Float32
     mask_rows: NDArray[np.int32]
+    scale: float
+    grazing: float
 
     @classmethod
     def make(
@@ -707,6 +726,7 @@ class _Plan:
         single = ~scene.bordering[span]
         middle = scene.offsets[:-1][span] + np.diff(scene.offsets)[span] // 2
         positions, normals = scene.positions[middle], scene.normals[middle]
+        views = scene.views[middle]
         lattice = _Lattice(scene.height, scene.width, x, y, single, positions, normals)
         everything = np.arange(count)
         known = np.zeros(count, bool)  # has a visibility row
@@ -736,6 +756,14 @@ class _Plan:
         weights[:, 0] = 1.0
         around = nothing.copy()
         open_ = everything[single]
+        # half vectors move against the normal with either of them
+        bend = np.concatenate([normals, 0.5 * views], axis=1)
+        found, weight = lattice.cell(open_, _LEVELS[0])
+        off, spread = _departure(bend, open_, found, weight)
+        off, spread = (np.where((weight != 0.0).any(axis=1), d, np.inf) for d in (off, spread))
+        fits = [np.count_nonzero(_predictable(off, spread, loose * s)) for s in (*_SCALES, 1.0)]
+        good = [s for s, n in zip(_SCALES, fits, strict=False) if n >= max(_KEPT * fits[-1], 1)]
+        scale = good[0] if good else 1.0
         for level in _LEVELS:
             on = lattice.on(level)
             if level != _LEVELS[0]:
@@ -745,7 +773,7 @@ class _Plan:
                 look(on, around[on], 2, verify=True)
             found, weight = lattice.cell(open_, level)
             ok = (weight != 0.0).any(axis=1)
-            ok &= _predictable(normals, open_, found, weight, loose)
+            ok &= _predictable(*_departure(bend, open_, found, weight), loose * scale)
             if casts is not None:
                 ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
             good = open_[ok]
@@ -775,7 +803,8 @@ class _Plan:
             mask_rows = -np.sort(-mask_rows, axis=1)  # the walk reads up to the first -1
         return cls(
             computed, index.reshape(corners.shape).astype(np.int32),
-            weights.astype(np.float32), mask_rows,
+            weights.astype(np.float32), mask_rows, scale,
+            math.acos(np.einsum("mc,mc->m", normals, views).clip(0.0, 1.0).min(initial=1.0)),
         )  # fmt: skip
 
 
@@ -836,16 +865,20 @@ class _Lattice:
         return corners, weights
 
 
-def _predictable(
-    normals: Float64, some: Int64, corners: Int64, weights: Float64, loose: float
-) -> NDArray[Any]:
-    """Whether normals vary so linearly over a cell that images of wide lobes do."""
+def _departure(
+    bend: Float64, some: Int64, corners: Int64, weights: Float64
+) -> tuple[Float64, Float64]:
+    """How far `bend` of fragments `some` (m,) is from their cells' corners: from the mean, and from
+    any."""
     at = np.where(corners >= 0, corners, some[:, None])
-    around = normals[at]
-    own = normals[some]
+    around, own = bend[at], bend[some]
     off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
-    spread = np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
-    answer: NDArray[Any] = (off < loose * _BEND[0]) & (spread < loose * _BEND[1])
+    return off, np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
+
+
+def _predictable(off: Float64, spread: Float64, loose: float) -> NDArray[np.bool_]:
+    """Whether half vectors vary so linearly over a cell that images of wide lobes do."""
+    answer: NDArray[np.bool_] = (off < loose * _BEND[0]) & (spread < loose * _BEND[1])
     return answer
 
 
@@ -914,10 +947,23 @@ def _divided(environment: EnvironmentMap) -> EnvironmentMap:
     return EnvironmentMap(image, environment.rotation)
 
 
-def _near_window(grid: HalfDiffGrid) -> Float32:
-    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 over `_SPLIT`."""
-    t = np.clip((grid.theta_h - _SPLIT[0]) / (_SPLIT[1] - _SPLIT[0]), 0.0, 1.0)
+def _near_window(grid: HalfDiffGrid, low: float, high: float) -> Float32:
+    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 from `low` to `high`,
+    which are nodes: so leaves of either side meet none of the other's."""
+    t = np.clip((grid.theta_h - low) / (high - low), 0.0, 1.0)
     return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
+
+
+def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
+    """The theta_h within which tables (grid.size, T) hardly change: the width of their lobes.
+
+    Views further from the normal than `grazing` are not asked for.
+    """
+    seen = grid.theta_d <= grazing + _SPLIT[1]
+    values = tables.reshape(*grid.shape, -1)[:, seen].reshape(grid.shape[0], -1, tables.shape[1])
+    change = np.abs(values - values[0]).max(axis=1) > _FLAT * np.abs(values).max(axis=(0, 1))
+    steps = np.flatnonzero(change.any(axis=1))
+    return float(grid.theta_h[max(steps[0] - 1, 0)]) if len(steps) else 0.5 * math.pi
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
@@ -1129,7 +1175,7 @@ def _walk(
     leaves: Any, ask: Any, answers: Any, n: Any, v: Any, mask: Any,
     place: Any, moment: Any, child: Any, box: Any, image: Any,
     first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    spread: Any, rule: Any, low: Any, high: Any, outline: Any,
+    spread: Any, rule: Any, low: Any, high: Any, outline: Any, lobe: Any,
     stack: Any, fates: Any, cells: Any,
 ) -> Any:  # fmt: skip
     """Leaves of one group into `leaves` (13, n): direction, vector irradiance RGB, variance.
@@ -1138,10 +1184,11 @@ def _walk(
     into `ask` and the light let through if `answers` says so (1).
 
     A node is a leaf where its reach in half-vector space is at most `relative` times its distance
-    from the mirror peak, it carries at most the share `brightest` of the irradiance or is
-    accordingly smaller, it is no wider than `widest`, and, if the horizon cuts it, `horizon`.
-    `low` and `high` bound sin(theta_h). All holds for half vectors up to `spread` away from those
-    of `n` and `v`. Returns the number of leaves, the capacity if too many, and of questions.
+    from the mirror peak (or times `lobe`, where that is more), it carries at most the share
+    `brightest` of the irradiance or is accordingly smaller, it is no wider than `widest`, and, if
+    the horizon cuts it, `horizon`. `low` and `high` bound sin(theta_h). All holds for half vectors
+    up to `spread` away from those of `n` and `v`. Returns the number of leaves, the capacity if too
+    many, and of questions.
     """
     relative, brightest, horizon, widest = rule[0], rule[1], rule[2], rule[3]
     t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
@@ -1238,7 +1285,7 @@ def _walk(
                 + n1 * (moment[i, 1] + moment[i, 4] + moment[i, 7])
                 + n2 * (moment[i, 2] + moment[i, 5] + moment[i, 8])
             )
-        allowed = relative * (max(sin_h - reach - spread, f32(0.0)) + f32(3e-3))
+        allowed = relative * (max(sin_h - reach - spread, lobe) + f32(3e-3))
         share = flux / total
         if share > brightest:
             allowed *= max(f32(0.25), f32(math.sqrt(brightest / share)))
@@ -1488,7 +1535,7 @@ def _shade(
     middle_normals: Any, middle_views: Any, spread: Any, masks: Any, several: Any,
     place: Any, moment: Any, child: Any, box: Any, image: Any,
     first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    rules: Any, low: Any, high: Any, outline: Any, capacity: Any,
+    rules: Any, low: Any, high: Any, outline: Any, lobe: Any, capacity: Any,
     n_h: Any, n_d: Any, n_p: Any, tables: Any,
 ) -> None:  # fmt: skip
     """Add the leaves of all groups: to radiance, or to rows where `tables` has no column.
@@ -1513,7 +1560,7 @@ def _shade(
             count, asked[g] = _walk(
                 leaves, ask[g], answers[g], middle_normals[g], middle_views[g], masks[g],
                 place, moment, child, box, image, first, last, hidden, unseen, unhidden,
-                spread[g], rules[1 if several[g] else 0], low, high, outline,
+                spread[g], rules[1 if several[g] else 0], low, high, outline, lobe,
                 stack, fates, cells,
             )  # fmt: skip
             if count == capacity:

@@ -28,7 +28,7 @@ import concurrent.futures
 import math
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -193,6 +193,9 @@ class Transport:
         Chooses the subset and the probes.
     device : torch device of the frames
     progress : called with (stage, fraction); may raise to cancel
+    fixed : tables (grid.size, 3) by index into ``scene.parts``
+        Parts that keep their material. A group of nothing else is prepared for these tables alone,
+        which takes a fraction of the time; `freed` prepares it for all others.
     """
 
     TRAINING_ROWS = 320
@@ -216,20 +219,60 @@ class Transport:
         seed: int = 0,
         device: str | torch.device = "cpu",
         progress: Progress | None = None,
+        fixed: Mapping[int, Float32] | None = None,
     ) -> None:
-        shape = training.tables.shape
-        if shape != (grid.size, len(training.weight)) or not len(training.weight):
-            raise ValueError(
-                f"training: expected shape ({grid.size}, tables) with a weight for each table, "
-                f"got {shape} and {len(training.weight)} weights"
-            )
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
+        for part, table in (fixed or {}).items():
+            if not 0 <= part < len(scene.parts) or table.shape != (grid.size, 3):
+                raise ValueError(
+                    f"fixed: expected tables ({grid.size}, 3) of {len(scene.parts)} parts, got "
+                    f"{table.shape} for part {part}"
+                )
         self._begin(scene, grid, rank, resolution, device)
+        self._compress_groups(training, fixed or {}, (), seed, progress)
+
+    def freed(
+        self, training: Training, seed: int = 0, progress: Progress | None = None
+    ) -> Transport:
+        """What a transport of these settings without fixed parts would be.
+
+        The bases of the other parts are shared, not computed again. This transport stays as it is.
+        """
+        other = Transport.__new__(Transport)
+        other._begin(self.scene, self.grid, self.rank, self.resolution, self.device)
+        if self._operator is not None:  # its own: this one may be in use
+            tree = self._operator.tree
+            other._operator = Operator(self.scene, self.grid, self.resolution, tree)
+        known = [
+            None if self.fixed.intersection(basis.parts) else replace(basis) for basis in self.bases
+        ]
+        for part in range(len(self.parts)):
+            if part not in self.fixed:
+                other.parts[part] = self.parts[part]
+        other._compress_groups(training, {}, known, seed, progress)
+        return other
+
+    def _compress_groups(
+        self,
+        training: Training,
+        fixed: Mapping[int, Float32],
+        known: Sequence[_Basis | None],
+        seed: int,
+        progress: Progress | None,
+    ) -> None:
+        """The bases of all groups, but those that are known."""
+        shape = training.tables.shape
+        if shape != (self.grid.size, len(training.weight)) or not len(training.weight):
+            raise ValueError(
+                f"training: expected shape ({self.grid.size}, tables) with a weight for each "
+                f"table, got {shape} and {len(training.weight)} weights"
+            )
         report = progress or (lambda stage, fraction: None)
-        rng = np.random.default_rng(seed)
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
+        groups = self._groups()
+        missing = [g for g in range(len(groups)) if g >= len(known) or known[g] is None]
         # the next part's rays are cast while others are shaded
         cancelled, operator = threading.Event(), self.operator
 
@@ -242,13 +285,20 @@ class Transport:
 
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             try:
-                casting = {
-                    part: pool.submit(cast, part) for group in self._groups() for part in group
-                }
-                for group in self._groups():
-                    self.bases.append(
-                        self._compress(group, tables, importance, rng, casting, report)
-                    )
+                casting = {part: pool.submit(cast, part) for g in missing for part in groups[g]}
+                for g, group in enumerate(groups):
+                    basis = None if g in missing else known[g]
+                    if basis is None:
+                        rng = np.random.default_rng([seed, g])
+                        if fixed.keys() >= set(group):
+                            self.fixed |= set(group)
+                            some = np.concatenate([fixed[part] for part in group], axis=1)
+                            mix = np.unique(some, axis=1)
+                            need = np.ones(mix.shape[1])
+                        else:
+                            mix, need = self._combinations(group, tables, importance, rng)
+                        basis = self._compress(group, mix, need, rng, casting, report)
+                    self.bases.append(basis)
             finally:
                 cancelled.set()
         self._join_cells()
@@ -280,6 +330,8 @@ class Transport:
         self.device = torch.device(device)
         self.grey = _is_grey(scene)
         """Whether all light is grey, so that one channel of the basis serves all three."""
+        self.fixed: frozenset[int] = frozenset()
+        """Parts that were prepared for one material alone."""
         self.bases: list[_Basis] = []
         self.parts: list[_Part | None] = [None] * len(scene.parts)
         self._projected: tuple[Any, ...] = ()
@@ -306,20 +358,17 @@ class Transport:
     def _compress(
         self,
         group: range,
-        tables: torch.Tensor,
-        importance: torch.Tensor,
+        mix: Float32,
+        need: Float64,
         rng: np.random.Generator,
         casting: Mapping[int, concurrent.futures.Future[None]],
         report: Progress,
     ) -> _Basis:
+        """The basis of a group from its images under the tables `mix` (cells, R), of which
+        `need` (R,) is the weight."""
         scene, operator = self.scene, self.operator
         fragments = self._fragments(group)
         colours = 1 if self.grey else 3
-        subset = self._subset(group, rng)
-        # an operator of its own: what rays are cast must not depend on what other threads know
-        scout = Operator(scene, self.grid, self.resolution, operator.tree)
-        mix, need = self._combinations(scout.rows(subset), tables, importance)
-        del scout
         whole = torch.empty((colours, len(fragments), mix.shape[1]))
         for part in group:
             span = scene.part_slice(part)
@@ -375,12 +424,19 @@ class Transport:
         return np.stack([rows[at, c] for c, at in enumerate(where.reshape(probes.shape))])
 
     def _combinations(
-        self, rows: Float32, tables: torch.Tensor, importance: torch.Tensor
+        self,
+        group: range,
+        tables: torch.Tensor,
+        importance: torch.Tensor,
+        rng: np.random.Generator,
     ) -> tuple[Float32, Float64]:
-        """M = X Y Sigma^-1 (cells, R) for rows (m, 3, cells) of the subset, and Sigma (R,).
+        """M = X Y Sigma^-1 (cells, R), from the rows of a group's subset, and Sigma (R,).
 
         One M serves the three colours, whose images differ: R is less than the rank.
         """
+        # an operator of its own: what rays are cast must not depend on what other threads know
+        scout = Operator(self.scene, self.grid, self.resolution, self.operator.tree)
+        rows = scout.rows(self._subset(group, rng))
         colours = 1 if self.grey else 3
         stacked = torch.from_numpy(rows[:, :colours].reshape(-1, rows.shape[-1]))
         images = (stacked @ tables).double()
@@ -442,7 +498,7 @@ class Transport:
         self, basis: torch.Tensor, size: int, rng: np.random.Generator
     ) -> tuple[Int64, Float64]:
         """Fragments and weights of the least-squares fit, drawn half by leverage, half evenly."""
-        count = self.FIT_FACTOR * basis.shape[-1]
+        count = self.FIT_FACTOR * max(basis.shape[-1], 8)
         if count >= size:
             return np.arange(size), np.ones(size)
         leverage = (basis.double() ** 2).sum(dim=1).numpy()
@@ -507,6 +563,7 @@ class Transport:
         known: dict[str, NDArray[Any]] = {
             "rank": np.array(self.rank),
             "resolution": np.array(self.resolution),
+            "fixed": np.isin(np.arange(len(self.parts)), list(self.fixed)),
         }
         for i, basis in enumerate(self.bases):
             for name in ("basis", "damping", "cells", "rows"):
@@ -557,6 +614,7 @@ class Transport:
                 raise ValueError(f"arrays: expected {name} from 0 to {limit - 1}")
             return value
 
+        self.fixed = frozenset(np.flatnonzero(taken("fixed", "b", (len(scene.parts),))).tolist())
         for g, group in enumerate(self._groups()):
             fragments = self._fragments(group)
             basis = taken(f"basis_{g}", "f", (len(fragments), -1))
@@ -738,7 +796,8 @@ class Draft:
     ) -> None:
         scale = min(1.0, size / max(scene.height, scene.width))
         shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
-        self.scene = scene.changed(size=shape, subsamples=1)
+        # what is enlarged is blurred anyway
+        self.scene = scene.changed(size=shape, subsamples=1) if scale < 1.0 else scene
         self.operator = Operator(self.scene, grid, resolution, tree)
         count = len(self.scene.pixels)
         rng = np.random.default_rng(seed)
