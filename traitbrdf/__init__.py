@@ -24,6 +24,7 @@ from traitbrdf.shapes import load_mesh as load_mesh
 from traitbrdf.shapes import sphere as sphere
 from traitbrdf.shapes import teapot as teapot
 from traitbrdf.strokes import Stroke as Stroke
+from traitbrdf.studio import studio as studio
 from traitbrdf.traits import TraitSpace as TraitSpace
 from traitbrdf.traits import default_traits as default_traits
 
@@ -51,5 +52,6 @@ __all__ = [
     "models",
     "reference",
     "sphere",
+    "studio",
     "teapot",
 ]

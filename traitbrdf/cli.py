@@ -1,4 +1,4 @@
-"""The command line: ``traitbrdf demo | paint | render | info | bench``.
+"""The command line: ``traitbrdf demo | paint | render | studio | info | bench``.
 
 Exit status: 0 done, 1 failed with one readable line, 2 wrong usage.
 """
@@ -9,7 +9,9 @@ import argparse
 import json
 import math
 import sys
+import threading
 import time
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ import traitbrdf as tb
 from traitbrdf import bench
 from traitbrdf.brdf import ALBEDO_ANGLES, Reflectance
 from traitbrdf.formats import exposure_of, tone_map, unknown_name, write_exr, write_png
+from traitbrdf.shapes import Shape
 from traitbrdf.strokes import follow
 
 DEMO_MATERIAL = "red-rubber"
@@ -84,6 +87,17 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
     render.set_defaults(run=_render)
 
+    studio = commands.add_parser("studio", help="paint live in a page on this machine")
+    _add_scene(studio)
+    studio.add_argument("--mesh", type=Path, help="mesh file (.obj, .ply, .glb, ...) to paint on")
+    studio.add_argument("--material", default="blue-plastic", help="library name (%(default)s)")
+    studio.add_argument("--design", type=Path, help="a design saved as .tbr; replaces the scene")
+    studio.add_argument(
+        "--port", type=int, default=0, help="0 takes any that is free (%(default)s)"
+    )
+    studio.add_argument("--no-browser", action="store_true", help="only print the address")
+    studio.set_defaults(run=_studio, ground=2.0)
+
     info = commands.add_parser("info", help="what the package ships, or what a file holds")
     info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
     info.set_defaults(run=_info)
@@ -136,13 +150,14 @@ def _trait(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _scene(given: argparse.Namespace) -> tb.Scene:
+def _scene(given: argparse.Namespace, mesh: Shape | None = None) -> tb.Scene:
     environment = (
         tb.EnvironmentMap.sky() if given.env is None else tb.EnvironmentMap.read(given.env)
     )
-    shape = tb.teapot() if given.shape == "teapot" else tb.sphere()
+    named = tb.teapot() if given.shape == "teapot" else tb.sphere()
+    shape = named if mesh is None else mesh
     azimuth, elevation, zoom = given.camera
-    if given.shape == "sphere" and tuple(given.camera) == DEMO_CAMERA:
+    if (given.shape == "sphere" or mesh is not None) and tuple(given.camera) == DEMO_CAMERA:
         zoom = 1.0
     camera = tb.Camera.orbit(azimuth, elevation, zoom=zoom)
     ground = given.ground if given.ground != 0.0 else False
@@ -325,6 +340,28 @@ def _material(name: str) -> str | Reflectance:
         return tb.MeasuredBRDF.read(name)
     tb.default_library().index(name)
     return name
+
+
+def _studio(given: argparse.Namespace) -> int:
+    # a web server, which no other command needs
+    from traitbrdf.studio.page import Server
+    from traitbrdf.studio.session import Session
+
+    if not 0 <= given.port <= 65535:
+        raise ValueError(f"--port: expected 0 to 65535, got {given.port}")
+    if given.design is not None:
+        edit = tb.EditSession.load(given.design)
+    else:
+        shape = None if given.mesh is None else tb.load_mesh(given.mesh)
+        edit = tb.EditSession(_scene(given, shape))
+        edit.assign(list(edit.scene.shape.parts), given.material)
+    session = Session(edit)
+    server = Server(session, given.port)
+    print(f"{server.url}\nCtrl+C ends it; designs are saved in {session.folder}", flush=True)
+    if not given.no_browser:
+        threading.Timer(0.5, webbrowser.open, (server.url,)).start()
+    server.run()
+    return 0
 
 
 def _info(given: argparse.Namespace) -> int:

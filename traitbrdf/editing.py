@@ -120,6 +120,16 @@ class Material:
     table: Float32 | None = None
     name: str = ""
 
+    def equals(self, other: Material) -> bool:
+        """Whether both are the same reflectance, of the same name."""
+        return (
+            self.name == other.name
+            and self.table is other.table
+            and (self.offset is other.offset)
+            and np.array_equal(self.z, other.z)
+            and np.array_equal(self.mirror, other.mirror)
+        )
+
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
         """f_r (n, 3) at `cells` (n,) of the embedding's grid; at all of them if left out."""
         if self.table is not None:
@@ -439,6 +449,8 @@ class _View:
 
     def keep(self, index: int, material: Material, shown: _Shown) -> None:
         """Keep a part's shading, the least recently used ones going first."""
+        old = self.kept.pop((index, material), None)
+        self.kept_bytes -= 0 if old is None else _size(old)
         self.kept[index, material] = shown
         self.kept_bytes += _size(shown)
         while self.kept_bytes > FRAMES_KEPT and len(self.kept) > len(self.scene.parts):
@@ -554,6 +566,17 @@ class EditSession:
         values = material.values(self.embedding).reshape(*grid.shape, 3)
         return TabulatedBRDF(grid, values, material.mirror, material.name or part)
 
+    def plausibility(self, part: str) -> dict[str, float]:
+        """How far a part's material can be believed, as `report` has it: ``energy_scale`` and
+        ``gamut_margin``."""
+        material = self.material(part)
+        span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
+        inside = (material.z - self.embedding.low_) / span
+        return {
+            "energy_scale": self._energy_scale(material),
+            "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
+        }
+
     def _energy_scale(self, material: Material) -> float:
         if material.table is not None:  # shown as it came
             return 1.0
@@ -651,14 +674,17 @@ class EditSession:
         z = self.traits.move(old.z, amounts, hold)
         if np.array_equal(z, old.z):
             return old
-        return replace(old, z=z, table=None)
+        new = replace(old, z=z, table=None)
+        # what was shown lately is the same material still: it need not be shaded again
+        return next((m for _, m in self._view.kept if m.equals(new)), new)
 
-    def paint(self, stroke: Stroke) -> dict[str, float]:
+    def paint(self, stroke: Stroke, only: str | Iterable[str] | None = None) -> dict[str, float]:
         """Paint a trait on the image: every part under the stroke moves by its share of it.
 
         Parameters
         ----------
         stroke : Stroke, in pixels of this scene's image
+        only : part or parts that may move, as if there were no others; None is all
 
         Returns
         -------
@@ -674,8 +700,13 @@ class EditSession:
         self.traits.index(stroke.trait)
         with self._lock:
             scene = self.scene
+            region = scene.part_image
+            if only is not None:
+                only = (only,) if isinstance(only, str) else tuple(only)
+                free = [self.part(name) for name in only]
+                region = np.where(np.isin(region, free), region, -1)
             weights = region_weights(
-                stroke.coverage(scene.height, scene.width), scene.part_image, len(scene.parts)
+                stroke.coverage(scene.height, scene.width), region, len(scene.parts)
             )
             moved = {
                 name: stroke.amount * float(weight)
@@ -696,10 +727,13 @@ class EditSession:
                 for name, amount in moved.items()
             }
             held = "" if stroke.hold is None else f", hold={hold!r}"
+            alone = ""
+            if only is not None:
+                alone = f", only={(only[0] if len(only) == 1 else only)!r}"
             self._edited.update(new)
             self._do(new, _Said(
                 f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
-                f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}))",
+                f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}){alone})",
                 "; ".join(_move_call(name, {stroke.trait: a}, hold) for name, a in moved.items()),
                 _framing(scene),
             ))  # fmt: skip
@@ -731,6 +765,21 @@ class EditSession:
             self._materials.update(edit.after)
             self._done.append(edit)
             return True
+
+    @property
+    def last(self) -> object:
+        """The last edit, to tell whether another has come since; None if there is none."""
+        return self._done[-1] if self._done else None
+
+    @property
+    def undoable(self) -> bool:
+        """Whether there is an edit to undo."""
+        return bool(self._done)
+
+    @property
+    def redoable(self) -> bool:
+        """Whether there is an undone edit to do again."""
+        return bool(self._undone)
 
     @property
     def history(self) -> list[str]:
@@ -946,7 +995,7 @@ class EditSession:
         view.times["draft"] = time.perf_counter() - start
         return materials, image, error
 
-    def render(self, wait: bool = True) -> Float32:
+    def render(self, wait: bool = True, exact: bool = True) -> Float32:
         """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.
 
         Parts whose material is the same object as at a recent frame are not computed again, and
@@ -956,6 +1005,9 @@ class EditSession:
         ----------
         wait : bool
             False returns the draft while the view is not prepared, and has it prepared behind.
+        exact : bool
+            False shows by the basis what it cannot promise as well, within milliseconds:
+            `doubtful` names those parts then, and `frame_error` has what was measured.
 
         Raises
         ------
@@ -966,12 +1018,42 @@ class EditSession:
                 view = self._view
                 transport = self._serving(view)
                 if transport is not None:
-                    return self._frame(view, transport)
+                    return self._frame(view, transport, exact)
             image, _ = self.draft()
             if self.prepare(wait=False) is None:
                 return image
         with self._prepared() as (view, transport):
-            return self._frame(view, transport)
+            return self._frame(view, transport, exact)
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Parts of the last frame whose measured error is more than the basis is trusted with."""
+        with self._lock:
+            view = self._view
+            return [
+                view.scene.parts[i]
+                for i, one in enumerate(view.shown)
+                if one.tier != "exact" and one.frame.error > self._allowed(view, i)
+            ]
+
+    def before(self) -> Float32:
+        """The frame (H, W, 3) as it would be without this session's edits; nothing is changed."""
+        with self._prepared() as (view, transport):
+            now = dict(self._materials)
+            for edit in reversed(self._done):
+                self._materials.update(edit.before)
+            try:
+                return self._frame(view, transport, exact=False)
+            finally:
+                self._materials = now
+
+    @property
+    def frame_error(self) -> float | None:
+        """Mean relative L1 of the last frame by its own measurement; None before the first."""
+        with self._lock:
+            view = self._view
+            known = view.prepared
+            return _measured(view, known.transport) if known is not None and view.shown else None
 
     def frames(self) -> Iterator[tuple[Float32, float, float]]:
         """Images that get better: the draft, then the finished frame.
@@ -1019,13 +1101,13 @@ class EditSession:
                     yield view, transport
                     return
 
-    def _frame(self, view: _View, transport: Transport) -> Float32:
+    def _frame(self, view: _View, transport: Transport, exact: bool = True) -> Float32:
         start = time.perf_counter()
         tables: dict[Material, torch.Tensor] = {}
         materials = [self._materials[part] for part in view.scene.parts]
         wanted = Counter(m for i, m in enumerate(materials) if (i, m) not in view.kept)
         shown = [
-            self._shade(view, transport, i, material, tables, wanted[material] == 1)
+            self._shade(view, transport, i, material, tables, wanted[material] == 1, exact)
             for i, material in enumerate(materials)
         ]
         if view.canvas is None:
@@ -1044,11 +1126,14 @@ class EditSession:
         material: Material,
         tables: dict[Material, torch.Tensor],
         alone: bool,
+        exact: bool,
     ) -> _Shown:
         """One part's shading; `tables` holds what was decoded for this frame, and `alone` says
-        that only this part wants its material's."""
+        that only this part wants its material's. Unless `exact`, the basis has the last word."""
         known = view.kept.get((index, material))
-        if known is not None:
+        if known is not None and not (
+            exact and known.tier != "exact" and known.frame.error > self._allowed(view, index)
+        ):
             view.kept.move_to_end((index, material))
             return known
         start = time.perf_counter()
@@ -1063,7 +1148,7 @@ class EditSession:
         part = transport.parts[index]
         if part is not None and part.group in view.budget:
             tier = "trained"
-        if frame.error > self._allowed(view, index):
+        if exact and frame.error > self._allowed(view, index):
             frame, tier = self._exactly(view, transport, index, material, mirror), "exact"
             tables.clear()  # the transport may see other cells by now
         shown = _Shown(frame, tier, time.perf_counter() - start)
@@ -1209,17 +1294,14 @@ class EditSession:
             }
 
     def _part_report(self, part: str, material: Material, shown: _Shown) -> dict[str, Any]:
-        span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
-        inside = (material.z - self.embedding.low_) / span
         return {
             "material": material.name,
             "pixels": len(shown.frame.radiance),
             "error": shown.frame.error,
             "tier": shown.tier,
             "scores": self.traits.score(material.z),
-            "energy_scale": self._energy_scale(material),
             "max_albedo": self.brdf(part).max_albedo(),
-            "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
+            **self.plausibility(part),
         }
 
     def _left_out(self, view: _View, transport: Transport) -> dict[str, Any]:

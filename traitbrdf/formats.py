@@ -468,6 +468,30 @@ def tone_map(linear: ArrayLike, exposure: float = 1.0) -> NDArray[np.uint8]:
     return encode_srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14))
 
 
+class Display:
+    """`tone_map` at one exposure, by table: many times as fast, and within one level of it.
+
+    Parameters
+    ----------
+    exposure : as for `tone_map`
+    """
+
+    _STEPS = 4096
+    _WHITE = 16.0  # the curve is flat beyond
+
+    def __init__(self, exposure: float) -> None:
+        self.exposure = exposure
+        levels = np.arange(int(self._WHITE * self._STEPS)) / self._STEPS
+        grey = tone_map(np.repeat(levels[:, None], 3, axis=1) / exposure, exposure)
+        self._table = np.ascontiguousarray(grey[:, 0])
+
+    def __call__(self, linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """(..., 3) uint8 of linear radiance (..., 3) that is not negative and holds no NaN."""
+        scaled = linear * np.float32(self.exposure * self._STEPS)
+        np.minimum(scaled, np.float32(len(self._table) - 1), out=scaled)
+        return self._table[scaled.astype(np.uint16)]
+
+
 def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
     """The message for a name that does not exist: the near ones, and some that do."""
     near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4)

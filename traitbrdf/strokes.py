@@ -93,29 +93,63 @@ class Stroke:
         nothing.
         """
         result = np.zeros((height, width), np.float32)
+        squared, (y0, y1, x0, x1) = self._distances(height, width)
+        squared = squared[y0:y1, x0:x1]
+        # beyond the rim all is the same: do not divide by a tiny radius there
+        away = np.minimum(np.sqrt(squared), self.radius)
+        fade = np.clip(2.0 - 2.0 * away / self.radius, 0.0, 1.0)
+        result[y0:y1, x0:x1] = fade * fade * (3.0 - 2.0 * fade)
+        return result
+
+    def extended(
+        self, points: Sequence[tuple[float, float]], amount: float | None = None
+    ) -> Stroke:
+        """This stroke with more points, and another amount unless that is None.
+
+        What this one has measured on an image is handed on, so that a stroke can grow while it is
+        painted without being measured anew.
+
+        Raises
+        ------
+        As for a new stroke.
+        """
+        amount = self.amount if amount is None else amount
+        longer = Stroke((*self.points, *points), self.trait, amount, self.radius, self.hold)
+        known = self.__dict__.pop("_measured", None)
+        if known is not None:
+            object.__setattr__(longer, "_measured", known)
+        return longer
+
+    def _distances(self, height: int, width: int) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+        """Squared distances (height, width) from the polyline, right where they are within reach,
+        and the rows and columns outside of which nothing is."""
+        known = self.__dict__.pop("_measured", None)
+        if known is not None and known[0].shape == (height, width):
+            squared, box, done = known
+        else:
+            squared, box, done = np.full((height, width), np.inf), (height, 0, width, 0), 0
         line = np.asarray(self.points)
-        reach = self.radius
-        x0, y0 = np.floor(line.min(axis=0) - reach).astype(int)
-        x1, y1 = np.ceil(line.max(axis=0) + reach).astype(int) + 1
-        x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-        if x0 >= x1 or y0 >= y1:
-            return result
-        x = np.arange(x0, x1) + 0.5
-        y = (np.arange(y0, y1) + 0.5)[:, None]
-        squared = np.full((y1 - y0, x1 - x0), np.inf)
         ends = line[1:] if len(line) > 1 else line
-        for (ax, ay), (bx, by) in zip(line, ends, strict=False):
+        begun = max(done - 1, 0)  # a dab alone is a segment to itself, which its line covers
+        for (ax, ay), (bx, by) in zip(line[begun:], ends[begun:], strict=False):
+            x0 = min(max(math.floor(min(ax, bx) - self.radius), 0), width)
+            x1 = min(max(math.ceil(max(ax, bx) + self.radius) + 1, x0), width)
+            y0 = min(max(math.floor(min(ay, by) - self.radius), 0), height)
+            y1 = min(max(math.ceil(max(ay, by) + self.radius) + 1, y0), height)
+            if x0 >= x1 or y0 >= y1:
+                continue
+            box = (min(box[0], y0), max(box[1], y1), min(box[2], x0), max(box[3], x1))
+            x = np.arange(x0, x1) + 0.5
+            y = (np.arange(y0, y1) + 0.5)[:, None]
             dx, dy = bx - ax, by - ay
             length = dx * dx + dy * dy
             t = ((x - ax) * dx + (y - ay) * dy) / length if length > 0.0 else 0.0
             t = np.clip(t, 0.0, 1.0)
             away = (x - ax - t * dx) ** 2 + (y - ay - t * dy) ** 2
-            np.minimum(squared, away, out=squared)
-        # beyond the rim all is the same: do not divide by a tiny radius there
-        away = np.minimum(np.sqrt(squared), reach)
-        fade = np.clip(2.0 - 2.0 * away / reach, 0.0, 1.0)
-        result[y0:y1, x0:x1] = fade * fade * (3.0 - 2.0 * fade)
-        return result
+            near = squared[y0:y1, x0:x1]
+            np.minimum(near, away, out=near)
+        object.__setattr__(self, "_measured", (squared, box, len(line)))
+        return squared, box
 
 
 def region_weights(
@@ -133,7 +167,7 @@ def region_weights(
     -------
     (count,) weights that sum to 1, or all 0 where the stroke misses the object.
     """
-    on = region >= 0
+    on = (region >= 0) & (coverage > 0.0)
     totals = np.bincount(region[on], weights=coverage[on], minlength=count)[:count]
     whole = totals.sum()
     return np.asarray(totals / whole if whole > 0.0 else totals, np.float64)

@@ -1,0 +1,684 @@
+"""The live canvas without a browser: the session, the page's server, the widget, the module."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+import traitbrdf as tb
+from traitbrdf import editing
+from traitbrdf.editing import EditSession
+from traitbrdf.formats import Display, exposure_of, tone_map
+from traitbrdf.strokes import Stroke, follow
+from traitbrdf.studio import studio
+from traitbrdf.studio.page import Server, application, pack, unpack
+from traitbrdf.studio.session import LARGEST, Session
+from traitbrdf.transport import Transport
+
+BRUSH = {"trait": "shiny", "amount": -0.6, "radius": 2.0, "stay": True}
+
+
+@pytest.fixture(scope="module")
+def prepared(small_teapot, training):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(editing, "_training", lambda library, seed: training)
+        return EditSession(small_teapot, quality="preview", cache=False).prepare()
+
+
+@pytest.fixture
+def session(prepared, training, tmp_path, monkeypatch):
+    """Over a prepared teapot, of one material."""
+    monkeypatch.setattr(editing, "_training", lambda library, seed: training)
+    edit = EditSession(prepared.scene, quality="preview", cache=False)
+    again = Transport.restored(prepared.scene, prepared.grid, prepared.arrays())
+    edit._view.prepared = editing._Prepared(again, False, {})
+    session = Session(edit, tmp_path)
+    yield session
+    session.close()
+
+
+def samples(points, pressure=1.0, lift=True, begin=True):
+    """Of one stroke, or of a piece of it."""
+    phase = [1.0] * len(points)
+    if begin:
+        phase[0] = 0.0
+    rows = [[x, y, pressure, p] for (x, y), p in zip(points, phase, strict=True)]
+    if lift:
+        rows.append([*points[-1], pressure, 2.0])
+    return np.array(rows, "<f4").tobytes()
+
+
+def along(session, part="handle"):
+    scene = session.edit.scene
+    points, _ = follow(scene.part_image == scene.parts.index(part))
+    return points
+
+
+def ask(session, buffers=(), view="a", **header):
+    return session.handle({"kind": "input", "view": view, "seq": 1, **header}, buffers)
+
+
+def frame(replies):
+    (found,) = (header for header, _ in replies if header["kind"] == "frame")
+    return found
+
+
+def errors(replies):
+    return [header["message"] for header, _ in replies if header["kind"] == "error"]
+
+
+class Screen:
+    """What a page draws."""
+
+    def __init__(self):
+        self.pixels = None
+
+    def draw(self, replies):
+        for header, buffers in replies:
+            if header["kind"] != "frame":
+                continue
+            if self.pixels is None or self.pixels.shape[:2] != (header["height"], header["width"]):
+                self.pixels = np.zeros((header["height"], header["width"], 3), np.uint8)
+            x, y, w, h = (header[key] for key in "xywh")
+            if header["format"] == "rgb":
+                drawn = np.frombuffer(buffers[0], np.uint8).reshape(h, w, 3)
+            elif header["format"] == "none":
+                continue
+            else:
+                drawn = np.asarray(Image.open(io.BytesIO(buffers[0])).convert("RGB"))
+            self.pixels[y : y + h, x : x + w] = drawn
+        return self.pixels.copy()
+
+
+# -- the protocol -----------------------------------------------------------------------------
+
+
+def test_hello_has_all_that_a_page_needs(session):
+    replies = session.handle({"kind": "hello", "view": "a", "seq": 3})
+    header = frame(replies)
+    scene = session.edit.scene
+    assert (header["view"], header["seq"]) == ("a", 3)
+    assert (header["width"], header["height"]) == (scene.width, scene.height)
+    assert (header["x"], header["y"], header["w"], header["h"]) == (0, 0, scene.width, scene.height)
+    assert header["parts"] == list(scene.parts)
+    assert header["traits"] == list(session.edit.traits.names)
+    assert "blue-plastic" in header["library"]
+    assert set(header["ms"]) == {"edit", "render", "encode"}
+    state = header["state"]
+    assert state["ready"] and state["fraction"] == 1.0
+    assert 0.0 < state["error"] < 0.1
+    assert set(state["scores"]) == set(header["traits"])
+    assert set(state["plausibility"]) == {"energy_scale", "gamut_margin"}
+    json.dumps(header, allow_nan=False)
+    image = session.edit.render(exact=False)
+    shown = Screen().draw(replies).astype(int)
+    assert np.abs(shown - tone_map(image, exposure_of(image))).mean() < 4.0
+
+
+def test_a_stroke_changes_the_handle_and_nothing_else(session):
+    screen = Screen()
+    session.handle({"kind": "hello", "view": "a"})
+    before = screen.draw(ask(session, rest=True))
+    old = {part: session.edit.material(part) for part in session.edit.scene.parts}
+    points = along(session)
+    screen.draw(ask(session, [samples(points[:3], lift=False)], brush=BRUSH))
+    screen.draw(ask(session, [samples(points[3:], begin=False)], brush=BRUSH))
+    after = screen.draw(ask(session, rest=True))
+    changed = {p for p in old if session.edit.material(p) is not old[p]}
+    assert changed == {"handle"}
+    scene = session.edit.scene
+    inside = np.zeros(scene.height * scene.width, bool)
+    inside[scene.pixels[scene.part_slice(scene.parts.index("handle"))]] = True
+    differs = (before != after).any(axis=-1).reshape(-1)
+    assert differs.any()
+    assert not differs[~inside].any()
+    assert len(session.edit.history) == 1
+    assert frame(ask(session))["state"]["part"] == "handle"
+
+
+def test_a_stroke_in_pieces_is_the_whole_stroke(session):
+    """However it arrives, it is one edit, and that of the stroke."""
+    points = along(session)
+    for i in range(len(points)):
+        last = i == len(points) - 1
+        piece = samples(points[i : i + 1], lift=last, begin=i == 0)
+        assert not errors(ask(session, [piece], brush=BRUSH))
+    (line,) = session.edit.history
+    kept = session.edit.material("handle").z.copy()
+    session.edit.undo()
+    assert not session.edit.undoable
+    whole = ask(session, [samples(points)], brush=BRUSH)
+    assert not errors(whole)
+    np.testing.assert_allclose(session.edit.material("handle").z, kept)
+    assert session.edit.history == [line]
+    amount = BRUSH["amount"]
+    session.edit.undo()
+    # long enough that it has all of the amount
+    edit = eval(line.replace("edit.paint(", "dict(stroke=", 1), {"tb": tb, "dict": dict})
+    assert edit["stroke"].amount == pytest.approx(amount)
+    assert edit["only"] == "handle"
+    session.edit.paint(edit["stroke"], edit["only"])
+    np.testing.assert_allclose(session.edit.material("handle").z, kept)
+
+
+def test_pressure_and_way_dose_a_stroke(session):
+    points = along(session)
+
+    def amount(rows, **brush):
+        assert not errors(ask(session, [rows], brush={**BRUSH, **brush}))
+        line = session.edit.history[-1]
+        ask(session, do="undo")
+        return float(line.split("amount=")[1].split(",")[0])
+
+    full = amount(samples(points))
+    assert full == pytest.approx(-0.6)
+    assert amount(samples(points, pressure=0.25)) == pytest.approx(0.25 * full, rel=1e-5)
+    assert amount(samples(points[:1])) == pytest.approx(full / 3.0)
+    assert amount(samples(points, pressure=7.0)) == pytest.approx(full)
+
+
+def test_strokes_in_one_message_are_edits_of_their_own(session):
+    both = samples(along(session)) + samples(along(session, "lid"))
+    assert not errors(ask(session, [both], brush=BRUSH))
+    assert len(session.edit.history) == 2
+    assert "only='handle'" in session.edit.history[0]
+    assert "only='lid'" in session.edit.history[1]
+
+
+def test_a_stroke_that_may_leave_its_part(session):
+    wide = {**BRUSH, "radius": 400.0, "stay": False}
+    ask(session, [samples(along(session))], brush=wide)
+    moved = {m.z.tobytes() for m in map(session.edit.material, session.edit.scene.parts)}
+    assert len(moved) > 3
+    assert "only" not in session.edit.history[0]
+
+
+def test_a_stroke_beside_the_object_does_nothing(session):
+    assert not errors(ask(session, [samples([(1.0, 1.0), (2.0, 1.0)])], brush=BRUSH))
+    assert session.edit.history == []
+    # and one that comes in from there paints where it arrives
+    ask(session, [samples([(1.0, 1.0), *along(session)])], brush=BRUSH)
+    assert len(session.edit.history) == 1
+
+
+def test_sliders_move_the_chosen_part(session):
+    old = session.edit.scores("lid")
+    for change in (0.1, 0.2, 0.4):
+        slide = {"part": "lid", "amounts": {"matte": change}, "done": change == 0.4}
+        state = frame(ask(session, slide=slide, part="lid"))["state"]
+    assert session.edit.history == ["edit.move('lid', matte=0.4, hold=('colour',))"]
+    assert state["scores"]["matte"] == pytest.approx(old["matte"] + 0.4, abs=0.05)
+    ask(session, slide={"part": "lid", "amounts": {"red": 0.3}, "done": True})
+    assert session.edit.history[1:] == ["edit.move('lid', red=0.3)"]
+
+
+def test_a_slider_at_work_takes_back_nothing_of_others(session):
+    ask(session, slide={"part": "lid", "amounts": {"matte": 0.1}})
+    session.edit.move("body", shiny=-0.2)  # a cell of the notebook
+    ask(session, slide={"part": "lid", "amounts": {"matte": 0.3}, "done": True})
+    assert [line.split("(")[1].split(",")[0] for line in session.edit.history] == [
+        "'lid'", "'body'", "'lid'",
+    ]  # fmt: skip
+
+
+def test_undo_redo_and_before(session):
+    screen = Screen()
+    first = screen.draw(ask(session, rest=True))
+    ask(session, [samples(along(session))], brush=BRUSH)
+    edited = screen.draw(ask(session, rest=True))
+    assert (first != edited).any()
+    np.testing.assert_array_equal(screen.draw(ask(session, before=True, rest=True)), first)
+    assert len(session.edit.history) == 1
+    np.testing.assert_array_equal(screen.draw(ask(session, rest=True)), edited)
+    reply = ask(session, do="undo", rest=True)
+    np.testing.assert_array_equal(screen.draw(reply), first)
+    assert (frame(reply)["state"]["undo"], frame(reply)["state"]["redo"]) == (False, True)
+    np.testing.assert_array_equal(screen.draw(ask(session, do="redo", rest=True)), edited)
+    assert not errors(ask(session, do="redo"))  # nothing to do again
+    assert errors(ask(session, do="dance"))
+
+
+def test_a_frame_at_rest_is_lossless(session):
+    replies = ask(session, rest=True)
+    image = session.edit.render(exact=False)
+    assert frame(replies)["format"] == "png"
+    np.testing.assert_array_equal(Screen().draw(replies), Display(exposure_of(image))(image))
+
+
+def test_only_what_changed_is_sent(session):
+    session.handle({"kind": "hello", "view": "a"})
+    assert frame(ask(session))["format"] == "none"
+    header = frame(ask(session, [samples(along(session))], brush=BRUSH))
+    assert header["format"] == "rgb"
+    scene = session.edit.scene
+    assert header["w"] * header["h"] < 0.3 * scene.width * scene.height
+
+
+def test_choosing(session):
+    assert frame(ask(session, part="lid"))["state"]["part"] == "lid"
+    scene = session.edit.scene
+    y, x = np.argwhere(scene.part_image == scene.parts.index("spout"))[3]
+    assert frame(ask(session, pick=[float(x), float(y)]))["state"]["part"] == "spout"
+    # beside the object, or beside the image, nothing else is chosen
+    for place in ([0.0, 0.0], [-5.0, 3.0], [1e5, 1e5]):
+        assert frame(ask(session, pick=place))["state"]["part"] == "spout"
+    state = frame(ask(session, assign={"part": "spout", "material": "gold-satin"}))["state"]
+    assert state["material"] == "gold-satin"
+    assert errors(ask(session, part="spoon"))[0].startswith("part: unknown part 'spoon'")
+    assert errors(ask(session, assign={"part": "lid", "material": "cheese"}))
+
+
+def test_orbit_zoom_and_turn(session):
+    old = session.edit.scene.camera
+    turned = session.edit.scene.environment.rotation
+    replies = ask(session, orbit=[20.0, 500.0], zoom=1.5, dragging=True)
+    camera = session.edit.scene.camera
+    assert camera.azimuth == pytest.approx(old.azimuth + 20.0)
+    assert (camera.elevation, camera.zoom) == (89.0, pytest.approx(1.5 * old.zoom))
+    state = frame(replies)["state"]
+    assert not state["ready"]
+    assert state["error"] > 0.0
+    ask(session, turn=90.0, dragging=True)
+    now = session.edit.scene.environment.rotation
+    assert (now - turned) % (2.0 * np.pi) == pytest.approx(0.5 * np.pi)
+    assert session._refiner is None  # nothing is prepared while the hand drags
+
+
+def test_views_are_prepared_once_the_hand_rests(session):
+    told = []
+    done = threading.Event()
+
+    def push(header, buffers):
+        told.append(header)
+        if header["ready"]:
+            done.set()
+
+    end = session.subscribe(push)
+    ask(session, orbit=[15.0, 0.0], dragging=True)
+    assert not frame(ask(session, dragging=False))["state"]["ready"]
+    assert done.wait(120.0)
+    assert {header["kind"] for header in told} == {"changed"}
+    replies = ask(session)
+    assert frame(replies)["state"]["ready"]
+    end()
+    count = len(told)
+    ask(session, part="lid")
+    assert len(told) == count
+
+
+def test_a_preparation_that_fails_is_told(session, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("no rays today")
+
+    monkeypatch.setattr(editing, "_prepare", fail)
+    ask(session, orbit=[15.0, 0.0])
+    session._refiner.join(60.0)
+    assert "no rays today" in frame(ask(session, dragging=True))["state"]["trouble"]
+
+
+def test_exact_frames_are_made_when_asked_for(session):
+    edit = session.edit
+    edit.error = 1e-9  # nothing meets that
+    state = frame(ask(session))["state"]
+    assert set(state["doubtful"]) == set(edit.scene.parts[: len(edit.scene.shape.parts)])
+    state = frame(ask(session, exact=True))["state"]
+    assert state["doubtful"] == []
+    assert edit.report()["exact_frames"] > 0
+
+
+def test_saving_and_opening(session, tmp_path):
+    ask(session, [samples(along(session))], brush=BRUSH)
+    shown = Screen().draw(ask(session, rest=True))
+    assert not errors(ask(session, save="mine"))
+    assert (tmp_path / "mine.tbr").is_file()
+    z = session.edit.material("handle").z
+    ask(session, do="undo")
+    assert not errors(ask(session, open="mine.tbr", dragging=True))
+    np.testing.assert_array_equal(session.edit.material("handle").z, z)
+    assert len(session.edit.history) == 1
+    session.edit.prepare()
+    again = Screen().draw(ask(session, rest=True))
+    assert np.abs(again.astype(int) - shown).max() <= 3
+    assert "did you mean" in errors(ask(session, open="mines"))[0]
+    for odd in ("", "../mine", "/etc/passwd", "a/b", "..", ".hidden", "c:x", "n\0", 7, "x" * 200):
+        assert errors(ask(session, save=odd)), odd
+        assert errors(ask(session, open=odd)), odd
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.tbr"]
+
+
+# -- what goes wrong --------------------------------------------------------------------------
+
+
+def test_two_views_of_one_session(session):
+    """Each draws what the other did, by asking for it when it suits."""
+    told = []
+    session.subscribe(lambda header, buffers: told.append(header))
+    first, second = Screen(), Screen()
+    for view, screen in (("a", first), ("b", second)):
+        screen.draw(session.handle({"kind": "hello", "view": view}))
+    first.draw(ask(session, [samples(along(session))], brush=BRUSH))
+    assert told[-1]["by"] == "a"
+    second.draw(ask(session, view="b"))
+    first.draw(ask(session, rest=True))
+    second.draw(ask(session, view="b", rest=True))
+    np.testing.assert_array_equal(first.pixels, second.pixels)
+
+
+def test_a_view_that_is_gone_is_no_trouble(session):
+    def gone(header, buffers):
+        raise ConnectionError("closed")
+
+    session.subscribe(gone)
+    assert not errors(ask(session, part="lid"))
+
+
+def test_an_edit_that_raises_is_told_and_the_session_goes_on(session, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("out of paint")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EditSession, "paint", fail)
+        replies = ask(session, [samples(along(session))], brush=BRUSH)
+    assert "out of paint" in errors(replies)[0]
+    assert frame(replies)["state"]["ready"]
+    assert not errors(ask(session, [samples(along(session))], brush=BRUSH))
+    with monkeypatch.context() as patch:
+        patch.setattr(EditSession, "render", fail)
+        ((header, _),) = ask(session)
+    assert (header["kind"], header["seq"]) == ("error", 1)
+    assert not errors(ask(session))
+
+
+def test_a_slow_frame_is_only_slow(session, monkeypatch):
+    render = EditSession.render
+
+    def slow(self, **arguments):
+        time.sleep(0.1)
+        return render(self, **arguments)
+
+    monkeypatch.setattr(EditSession, "render", slow)
+    assert frame(ask(session))["ms"]["render"] >= 100.0
+
+
+def test_ten_thousand_samples_at_once(session):
+    angle = np.linspace(0.0, 40.0, 10_000)
+    points = [(30.0 + 12.0 * np.cos(a), 24.0 + 12.0 * np.sin(a)) for a in angle]
+    replies = ask(session, [samples(points)], brush=BRUSH)
+    assert not errors(replies)
+    assert len(session.edit.history) == 1
+    assert len(session.edit.last.said.call) < 400_000
+    assert len(frame(replies)["state"]["history"][0]) < 200
+
+
+def test_messages_that_are_too_large(session):
+    (reply,) = session.handle({"kind": "input", "view": "a"}, [bytes(LARGEST + 1)])
+    assert "expected at most" in reply[0]["message"]
+
+
+def test_odd_samples_are_refused(session):
+    for odd in (b"123", np.full((1, 4), np.nan, "<f4").tobytes()):
+        assert errors(ask(session, [odd], brush=BRUSH))[0].startswith("brush: expected samples")
+    for odd in (None, [], {}, {**BRUSH, "radius": 0.0}, {**BRUSH, "trait": "tasty"},
+                {**BRUSH, "radius": "wide"}, {**BRUSH, "amount": float("inf")}):  # fmt: skip
+        assert errors(ask(session, [samples(along(session))], brush=odd)), odd
+    assert session.edit.history == []
+    # a piece of a stroke whose beginning was refused is nothing
+    ask(session, [samples(along(session), begin=False)], brush=BRUSH)
+    assert session.edit.history == []
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner),
+    max_leaves=8,
+)
+KEYS = st.sampled_from(
+    ["kind", "view", "seq", "part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn",
+     "do", "save", "open", "before", "rest", "pad", "exact"]
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    header=JSON | st.dictionaries(KEYS, JSON).map(lambda d: {"kind": "input", **d}),
+    buffers=st.lists(st.binary(max_size=40), max_size=2),
+)
+def test_no_message_makes_it_raise(session, header, buffers):
+    if isinstance(header, dict):
+        header["dragging"] = True  # a new view need not be prepared here
+    replies = session.handle(header, buffers)
+    assert replies
+    for reply, binary in replies:
+        assert reply["kind"] in ("frame", "error", "pad")
+        json.dumps(reply, allow_nan=False)
+        assert all(isinstance(part, bytes) for part in binary)
+
+
+def test_a_pad_follows_where_it_is_asked_for(session):
+    replies = ask(session, pad=True)
+    assert [header["kind"] for header, _ in replies] == ["frame", "pad"]
+    assert len(replies[-1][1][0]) == 66_000
+
+
+def test_strokes_that_grow_cover_what_whole_ones_do():
+    points = [(10.0 + 3.0 * i, 20.0 + 5.0 * np.sin(i)) for i in range(9)]
+    whole = Stroke(points, trait="shiny", amount=0.5, radius=4.0).coverage(48, 60)
+    grown = Stroke(points[:1], trait="shiny", amount=0.1, radius=4.0)
+    grown.coverage(48, 60)
+    for i in range(1, 9, 2):
+        grown = grown.extended(points[i : i + 2], 0.5)
+        if i != 3:
+            grown.coverage(48, 60)
+    assert grown == Stroke(points, trait="shiny", amount=0.5, radius=4.0)
+    np.testing.assert_array_equal(grown.coverage(48, 60), whole)
+    np.testing.assert_array_equal(grown.coverage(48, 60), whole)
+    other = Stroke(points, trait="shiny", amount=0.5, radius=4.0).coverage(30, 90)
+    np.testing.assert_array_equal(grown.coverage(30, 90), other)
+
+
+def test_a_display_shows_what_the_tone_map_does():
+    values = np.concatenate([np.geomspace(1e-6, 1e4, 3000), [0.0]])
+    linear = np.repeat(values[:, None], 3, axis=1).astype(np.float32)
+    for exposure in (0.01, 1.0, 37.0):
+        shown = Display(exposure)(linear).astype(int)
+        assert np.abs(shown - tone_map(linear, exposure)).max() <= 1
+
+
+# -- the page ---------------------------------------------------------------------------------
+
+HOME = "http://127.0.0.1:80"
+
+
+@pytest.fixture
+def client(session):
+    with TestClient(application(session, "secret", lambda: {HOME}), base_url=HOME) as client:
+        yield client
+
+
+def test_the_page_asks_for_its_token(client):
+    assert client.get("/").status_code == 403
+    assert client.get("/?token=guess").status_code == 403
+    page = client.get("/?token=secret")
+    assert page.status_code == 200
+    assert "page.js" in page.text
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+    for name in ("canvas.js", "page.js"):
+        module = client.get(f"/{name}")
+        assert module.status_code == 200
+        assert module.headers["content-type"].startswith("text/javascript")
+    for other in ("/session.py", "/../cli.py", "/nothing"):
+        assert client.get(other).status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("token", "origin"),
+    [
+        ("guess", HOME), ("", HOME), ("secret", "https://elsewhere.example"), ("secret", "null"),
+        ("secret", None), ("secr\u00e9t", HOME),
+    ],
+)  # fmt: skip
+def test_the_socket_asks_for_token_and_origin(client, session, token, origin):
+    headers = {} if origin is None else {"origin": origin}
+    with (
+        pytest.raises(WebSocketDisconnect) as closed,
+        client.websocket_connect(f"/socket?token={token}", headers=headers),
+    ):
+        pass
+    assert closed.value.code == 4403
+    assert not session._pushes
+
+
+def test_messages_over_the_socket(client, session):
+    with client.websocket_connect("/socket?token=secret", headers={"origin": HOME}) as socket:
+        socket.send_bytes(pack({"kind": "hello", "view": "a", "seq": 1}, []))
+        header, buffers = unpack(socket.receive_bytes())
+        assert (header["kind"], header["seq"]) == ("frame", 1)
+        assert Screen().draw([(header, buffers)]).shape == (header["height"], header["width"], 3)
+        message = {"kind": "input", "view": "a", "seq": 2, "brush": BRUSH}
+        socket.send_bytes(pack(message, [samples(along(session))]))
+        kinds = [unpack(socket.receive_bytes())[0]["kind"] for _ in range(2)]
+        assert sorted(kinds) == ["changed", "frame"]
+        for odd in (b"", b"\xff\xff\xff\xff", pack({}, [])[:5], b"\x02\0\0\0{]"):
+            socket.send_bytes(odd)
+            assert unpack(socket.receive_bytes())[0]["kind"] == "error"
+        socket.send_text("hello")
+        assert unpack(socket.receive_bytes())[0]["kind"] == "error"
+        assert len(session._pushes) == 1
+    deadline = time.monotonic() + 10.0
+    while session._pushes and time.monotonic() < deadline:  # a closed tab is forgotten
+        time.sleep(0.02)
+    assert not session._pushes
+    assert len(session.edit.history) == 1
+
+
+def test_packing():
+    assert unpack(pack({"kind": "x", "é": 1.5}, [b"abc"])) == ({"kind": "x", "é": 1.5}, [b"abc"])
+    assert unpack(pack({}, [])) == ({}, [])
+    for odd in (b"", b"abc", b"\x09\0\0\0{}", b"\x01\0\0\0{", b"\x01\0\0\0\xff"):
+        with pytest.raises(ValueError, match="message: expected"):
+            unpack(odd)
+
+
+@pytest.fixture
+def server(session):
+    server = Server(session)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    yield server
+    server.stop()
+    thread.join(30.0)
+    assert not thread.is_alive()
+
+
+def reach(server, **settings):
+    """A socket of the running server."""
+    origin = settings.pop("origin", f"http://127.0.0.1:{server.port}")
+    address = f"ws://127.0.0.1:{server.port}/socket?token={server.token}"
+    for _ in range(100):
+        try:
+            return connect(address, origin=origin, max_size=None, **settings)
+        except ConnectionRefusedError:
+            time.sleep(0.05)
+    raise AssertionError("no server")
+
+
+def test_a_served_session(server):
+    with reach(server) as socket:
+        socket.send(pack({"kind": "hello", "view": "a", "seq": 1}, []))
+        assert unpack(socket.recv())[0]["kind"] == "frame"
+    with reach(server) as socket:
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.send(bytes(LARGEST + 100))
+            socket.recv()
+        assert closed.value.rcvd.code == 1009  # too big
+    with reach(server) as socket:  # and the next tab is served
+        socket.send(pack({"kind": "hello", "view": "b", "seq": 1}, []))
+        assert unpack(socket.recv())[0]["kind"] == "frame"
+    with pytest.raises(Exception, match="403"):
+        reach(server, origin="http://127.0.0.1:1")
+
+
+def test_a_port_in_use_is_refused(session, server):
+    with pytest.raises(OSError):
+        Server(session, server.port)
+
+
+def test_servers_listen_on_this_machine_alone(server):
+    assert server.url.startswith("http://127.0.0.1:")
+    assert server._socket.getsockname()[0] == "127.0.0.1"
+    assert len(server.token) >= 32
+
+
+# -- the widget -------------------------------------------------------------------------------
+
+
+def test_the_widget_answers(session, monkeypatch):
+    widget = studio(session.edit)
+    sent = []
+    monkeypatch.setattr(widget, "send", lambda header, buffers=None: sent.append(header))
+    widget._handle_custom_msg({"kind": "hello", "view": "a", "seq": 1}, [])
+    assert sent[-1]["kind"] == "frame"
+    points = samples(along(session))
+    message = {"kind": "input", "view": "a", "seq": 2, "brush": BRUSH}
+    widget._handle_custom_msg(message, [memoryview(points)])
+    assert [header["kind"] for header in sent[-2:]] == ["changed", "frame"]
+    assert len(session.edit.history) == 1
+    widget._handle_custom_msg("what", [])
+    assert sent[-1]["kind"] == "error"
+    widget.close()
+
+
+def test_the_widget_leaves_a_still_picture(session):
+    widget = studio(session.edit)
+    bundle = widget._repr_mimebundle_()
+    bundle = bundle[0] if isinstance(bundle, tuple) else bundle
+    scene = session.edit.scene
+    assert Image.open(io.BytesIO(bundle["image/png"])).size == (scene.width, scene.height)
+    assert "application/vnd.jupyter.widget-view+json" in bundle
+    widget.close()
+
+
+def test_studio_wants_a_session():
+    with pytest.raises(TypeError, match="expected an EditSession"):
+        studio("teapot")
+
+
+def test_importing_the_package_imports_no_server():
+    code = (
+        "import sys, traitbrdf; "
+        "print([m for m in ('anywidget', 'starlette', 'uvicorn') if m in sys.modules])"
+    )
+    said = subprocess.run(
+        [shutil.which("python") or "python", "-c", code], capture_output=True, text=True, check=True
+    )
+    assert said.stdout.strip() == "[]"
+
+
+# -- the module -------------------------------------------------------------------------------
+
+
+def test_the_front_end_by_itself():
+    node = shutil.which("node")
+    if node is None:
+        if os.environ.get("CI") == "true":
+            pytest.fail("node is not installed: CI has to have it")
+        pytest.skip("node is not installed")
+    test = Path(__file__).with_name("canvas.test.mjs")
+    done = subprocess.run([node, "--test", str(test)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr

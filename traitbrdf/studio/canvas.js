@@ -1,0 +1,548 @@
+// The live canvas. One plain module for notebooks (anywidget) and for the page: the protocol stands
+// in session.py. `Link` decides what is sent when and knows no page; `Canvas` is what one sees.
+
+const LOST = 20000; // ms after which a request is taken for lost
+const CROWD = 8192; // samples of one request, beyond which every other one is left out
+const SLOW = 30; // ms of a round trip that no work explains
+const RESTS = 250; // ms until the hand rests
+const OTHERS = 100; // ms between two looks at what other views changed
+
+const sameKeys = (a, b) => JSON.stringify(Object.keys(a)) === JSON.stringify(Object.keys(b));
+
+/** One request in flight; what happens meanwhile is put together into the next. */
+export class Link {
+  constructor(view, send, { now = () => performance.now(), later = (act, ms) => setTimeout(act, ms) } = {}) {
+    Object.assign(this, { view, send, now, later });
+    this.queue = []; // of requests that cannot be put together
+    this.flying = null;
+    this.seq = 0;
+    this.slow = 0;
+    this.pad = false;
+  }
+
+  /** Ask for something; `join` says that it may become one with what waits. */
+  ask(header, join = true) {
+    const last = this.queue[this.queue.length - 1];
+    if (join && last && this.#fits(last.header, header)) {
+      for (const [key, value] of Object.entries(header)) {
+        if (key === "orbit") last.header.orbit = last.header.orbit
+          ? [last.header.orbit[0] + value[0], last.header.orbit[1] + value[1]] : value;
+        else if (key === "turn") last.header.turn = (last.header.turn ?? 0) + value;
+        else if (key === "zoom") last.header.zoom = (last.header.zoom ?? 1) * value;
+        else last.header[key] = value;
+      }
+    } else this.queue.push({ header: { ...header }, samples: [], newest: null });
+    this.pump();
+  }
+
+  #fits(old, fresh) {
+    // a stroke, a slider and a command are obeyed one after the other
+    const kinds = ["brush", "slide", "assign", "do", "save", "open", "pick", "hello"];
+    const had = kinds.filter((kind) => kind in old);
+    const has = kinds.filter((kind) => kind in fresh);
+    if (!had.length || !has.length) return !("hello" in old || "hello" in fresh);
+    if (had.length > 1 || had[0] !== has[0]) return false;
+    if (had[0] === "brush") return JSON.stringify(old.brush) === JSON.stringify(fresh.brush);
+    return had[0] === "slide" && !old.slide.done && old.slide.part === fresh.slide.part
+      && sameKeys(old.slide.amounts, fresh.slide.amounts);
+  }
+
+  /** Samples [x, y, pressure, phase, time] of the brush. */
+  paint(brush, samples) {
+    this.#hold = true;
+    this.ask({ brush });
+    this.#hold = false;
+    const last = this.queue[this.queue.length - 1];
+    for (const [x, y, pressure, phase, time] of samples) {
+      last.samples.push(x, y, pressure, phase);
+      last.newest = time ?? this.now();
+    }
+    if (last.samples.length > 4 * CROWD) {
+      const kept = [];
+      for (let i = 0; i < last.samples.length; i += 4) {
+        const moved = last.samples[i + 3] === 1;
+        if (!moved || (i / 4) % 2) kept.push(...last.samples.slice(i, i + 4));
+      }
+      last.samples = kept;
+    }
+    this.pump();
+  }
+
+  #hold = false;
+
+  pump() {
+    if (this.flying || this.#hold || !this.queue.length) return;
+    const { header, samples, newest } = this.queue.shift();
+    const seq = ++this.seq;
+    this.flying = { seq, sent: this.now(), newest };
+    const kind = "hello" in header ? "hello" : "input";
+    const message = { kind, view: this.view, seq, ...header };
+    delete message.hello;
+    if (this.pad) message.pad = true;
+    this.later(() => {
+      if (this.flying?.seq === seq) this.renew();
+    }, LOST);
+    this.send(message, samples.length ? [new Float32Array(samples).buffer] : []);
+  }
+
+  /** Take the reply to the request in flight; its times, or null if it is the reply to another. */
+  answered(header) {
+    const flown = this.flying;
+    if (!flown || header.seq !== flown.seq) return null;
+    this.flying = null;
+    const trip = this.now() - flown.sent;
+    const work = Object.values(header.ms ?? {}).reduce((a, b) => a + b, 0);
+    this.slow = header.ms && trip - work > SLOW ? this.slow + 1 : 0;
+    this.pad ||= this.slow >= 4;
+    this.pump();
+    return { trip, work, newest: flown.newest };
+  }
+
+  /** Begin anew: the other side may have forgotten, or be another. */
+  renew() {
+    this.flying = null;
+    this.queue = this.queue.filter(({ header }) => !("hello" in header));
+    this.queue.unshift({ header: { hello: true }, samples: [], newest: null });
+    this.pump();
+  }
+}
+
+/** RGBA bytes of RGB ones. */
+export function opaque(rgb) {
+  const out = new Uint8ClampedArray((rgb.length / 3) * 4);
+  for (let i = 0, k = 0; i < rgb.length; i += 3, k += 4) {
+    out[k] = rgb[i];
+    out[k + 1] = rgb[i + 1];
+    out[k + 2] = rgb[i + 2];
+    out[k + 3] = 255;
+  }
+  return out;
+}
+
+const STYLE = `
+.tb { display: flex; flex-wrap: wrap; gap: 16px; color: #ddd; background: #1d1f22; padding: 12px;
+  font: 13px/1.4 system-ui, sans-serif; outline: none; border-radius: 6px; }
+.tb-stage { position: relative; line-height: 0; align-self: flex-start; touch-action: none; }
+.tb-stage canvas { max-width: 100%; background: #000; cursor: none; border-radius: 4px; }
+.tb-stage[data-tool=pick] canvas { cursor: pointer; }
+.tb-stage[data-tool=orbit] canvas, .tb-stage[data-tool=light] canvas { cursor: move; }
+.tb-ring { position: absolute; border: 1.5px solid #fff; border-radius: 50%; pointer-events: none;
+  mix-blend-mode: difference; display: none; left: 0; top: 0; box-sizing: border-box; }
+.tb-stage[data-tool=brush]:hover .tb-ring { display: block; }
+.tb-side { width: 290px; display: flex; flex-direction: column; gap: 8px; }
+.tb-row { display: flex; gap: 6px; align-items: center; }
+.tb-row > label { width: 62px; color: #9aa0a6; }
+.tb-row > select, .tb-row > input { flex: 1; min-width: 0; }
+.tb output { width: 40px; text-align: right; font-variant-numeric: tabular-nums; }
+.tb button, .tb select, .tb input[type=text] { background: #2b2e33; color: #eee;
+  border: 1px solid #4a4e55; border-radius: 4px; padding: 3px 8px; font: inherit; }
+.tb button[aria-pressed=true] { background: #3b6ea5; border-color: #6aa0dc; }
+.tb button:disabled { opacity: 0.4; }
+.tb input[type=range] { accent-color: #6aa0dc; }
+.tb-sliders { max-height: 230px; overflow-y: auto; border-top: 1px solid #3a3d42;
+  border-bottom: 1px solid #3a3d42; padding: 4px 2px; }
+.tb-status { font-variant-numeric: tabular-nums; color: #b7bcc2; min-height: 3.9em; }
+.tb-status b { color: #fff; font-weight: 600; }
+.tb-bad { color: #ff9d7a; }
+.tb pre { margin: 0; font: 11px/1.35 ui-monospace, monospace; color: #9fc3e8; white-space: pre-wrap;
+  overflow-wrap: anywhere; max-height: 9em; overflow-y: auto; background: none; }
+`;
+
+function make(tag, properties = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(properties)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key in element && key !== "list") element[key] = value;
+    else element.setAttribute(key, value);
+  }
+  element.append(...children);
+  return element;
+}
+
+const TOOLS = {
+  brush: "Brush (1): paint the chosen trait",
+  pick: "Pick (2): choose a part",
+  orbit: "Orbit (3): turn the camera by dragging; also with the right button",
+  light: "Light (4): turn the map by dragging",
+};
+
+class Canvas {
+  constructor(model, el, fill) {
+    this.model = model;
+    this.view = Math.random().toString(36).slice(2);
+    this.link = new Link(this.view, (header, buffers) => model.send(header, undefined, buffers));
+    this.tool = "brush";
+    this.state = null;
+    this.drawn = [];
+    this.times = []; // of the last frames, for whoever measures
+    this.drawing = Promise.resolve();
+    this.build(el, fill);
+    this.listener = (header, buffers) => this.hear(header, buffers);
+    model.on("msg:custom", this.listener);
+    this.clock = setInterval(() => this.showStatus(), 500);
+    this.link.ask({ hello: true });
+  }
+
+  end() {
+    clearInterval(this.clock);
+    clearTimeout(this.resting);
+    this.model.off("msg:custom", this.listener);
+    for (const undo of this.undoing) undo();
+  }
+
+  // -- what is seen --------------------------------------------------------------------------
+
+  build(el, fill) {
+    this.undoing = [];
+    this.picture = make("canvas", { width: 512, height: 512 });
+    this.paper = this.picture.getContext("2d", { alpha: false });
+    this.ring = make("div", { className: "tb-ring" });
+    this.stage = make("div", { className: "tb-stage" }, this.picture, this.ring);
+    this.tools = Object.fromEntries(Object.entries(TOOLS).map(([name, title]) => [
+      name, make("button", { title, textContent: name, onclick: () => this.take(name) }),
+    ]));
+    this.parts = make("select", { ariaLabel: "part",
+      onchange: () => this.change({ part: this.parts.value }) });
+    this.library = make("select", { ariaLabel: "material", onchange: () => {
+      this.change({ assign: { part: this.state.part, material: this.library.value } }, false);
+    } });
+    this.trait = make("select", { ariaLabel: "trait" });
+    this.amount = this.range("amount", -1, 1, 0.6);
+    this.radius = this.range("radius", 3, 120, 24, 1);
+    this.stay = make("input", { type: "checkbox", checked: true });
+    this.undo = make("button", { textContent: "undo", title: "Ctrl+Z",
+      onclick: () => this.change({ do: "undo" }, false) });
+    this.redo = make("button", { textContent: "redo", title: "Ctrl+Shift+Z or Ctrl+Y",
+      onclick: () => this.change({ do: "redo" }, false) });
+    this.compare = make("button", { textContent: "before", ariaPressed: "false",
+      title: "B: show what was there before the first edit",
+      onclick: () => this.showBefore(!this.before) });
+    this.exact = make("button", { textContent: "exact", disabled: true,
+      title: "render without the basis what it cannot promise: takes seconds",
+      onclick: () => this.link.ask({ exact: true, rest: true }, false) });
+    this.name = make("input", { type: "text", value: "design", size: 10, ariaLabel: "file" });
+    const save = make("button", { textContent: "save",
+      onclick: () => this.change({ save: this.name.value }, false) });
+    const open = make("button", { textContent: "open",
+      onclick: () => this.change({ open: this.name.value }, false) });
+    this.sliders = make("div", { className: "tb-sliders" });
+    this.status = make("div", { className: "tb-status", role: "status" });
+    this.said = make("div", { className: "tb-bad", role: "alert" });
+    this.history = make("pre", { ariaLabel: "history" });
+    const row = (...children) => make("div", { className: "tb-row" }, ...children);
+    const named = (text, ...rest) => row(make("label", { textContent: text }), ...rest);
+    const side = make("div", { className: "tb-side" },
+      row(...Object.values(this.tools)),
+      named("part", this.parts), named("material", this.library), named("trait", this.trait),
+      named("amount", this.amount.input, this.amount.output),
+      named("radius", this.radius.input, this.radius.output),
+      make("label", { title: "a stroke paints only the part on which it begins" },
+        this.stay, " stay on one part"),
+      row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
+      this.sliders, this.status, this.said, this.history);
+    this.root = make("div", { className: "tb", tabIndex: 0, "data-lm-suppress-shortcuts": "true" },
+      make("style", { textContent: STYLE }), this.stage, side);
+    el.append(this.root);
+    this.root.studio = this;
+    this.take("brush");
+    this.listen(fill ? document : this.root);
+  }
+
+  range(name, min, max, value, step = 0.01) {
+    const output = make("output", { textContent: value });
+    const input = make("input", { type: "range", min, max, step, value, ariaLabel: name,
+      oninput: () => { output.textContent = input.value; } });
+    input.value = value;
+    return { input, output };
+  }
+
+  take(tool) {
+    this.tool = tool;
+    this.stage.dataset.tool = tool;
+    for (const [name, button] of Object.entries(this.tools)) {
+      button.setAttribute("aria-pressed", String(name === tool));
+    }
+  }
+
+  // -- what the hand does --------------------------------------------------------------------
+
+  listen(keys) {
+    const on = (target, name, act, options) => {
+      target.addEventListener(name, act, options);
+      this.undoing.push(() => target.removeEventListener(name, act, options));
+    };
+    on(this.stage, "contextmenu", (event) => event.preventDefault());
+    on(this.picture, "pointerdown", (event) => this.down(event));
+    on(this.picture, "pointermove", (event) => this.move(event));
+    for (const name of ["pointerup", "pointercancel"]) {
+      on(this.picture, name, (event) => this.up(event));
+    }
+    on(this.picture, "wheel", (event) => {
+      event.preventDefault();
+      this.drag({ zoom: Math.exp(-0.001 * event.deltaY) });
+      clearTimeout(this.wheeling);
+      this.wheeling = setTimeout(() => this.drop(), RESTS);
+    }, { passive: false });
+    on(keys, "keydown", (event) => this.key(event));
+  }
+
+  key(event) {
+    const letter = event.key.toLowerCase();
+    const typing = event.target instanceof HTMLInputElement && event.target.type === "text";
+    if (typing) {
+      event.stopPropagation();
+      return;
+    }
+    let act = null;
+    if ((event.ctrlKey || event.metaKey) && letter === "z") {
+      act = () => this.change({ do: event.shiftKey ? "redo" : "undo" }, false);
+    } else if ((event.ctrlKey || event.metaKey) && letter === "y") {
+      act = () => this.change({ do: "redo" }, false);
+    } else if (event.ctrlKey || event.metaKey || event.altKey) return;
+    else if (letter === "b" && !event.repeat) act = () => this.showBefore(!this.before);
+    else if ("1234".includes(letter)) act = () => this.take(Object.keys(TOOLS)[letter - 1]);
+    if (act) {
+      event.preventDefault();
+      event.stopPropagation();
+      act();
+    }
+  }
+
+  place(event) {
+    const box = this.picture.getBoundingClientRect();
+    const scale = this.picture.width / box.width;
+    return [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale];
+  }
+
+  sample(event, phase) {
+    const pressure = event.pointerType === "pen" ? event.pressure : 1;
+    return [...this.place(event), phase === 2 ? -1 : pressure, phase, event.timeStamp];
+  }
+
+  brush() {
+    return { trait: this.trait.value, amount: Number(this.amount.input.value),
+      radius: Number(this.radius.input.value), stay: this.stay.checked };
+  }
+
+  down(event) {
+    this.root.focus({ preventScroll: true });
+    this.picture.setPointerCapture(event.pointerId);
+    if (this.held || !this.state) return;
+    const turning = event.button === 2 || this.tool === "orbit";
+    this.held = turning ? "orbit" : this.tool;
+    this.from = [event.clientX, event.clientY];
+    if (this.before) this.showBefore(false);
+    if (this.held === "brush") {
+      this.pressure = event.pointerType === "pen" ? event.pressure : 1;
+      this.paint([this.sample(event, 0)]);
+    } else if (this.held === "pick") this.change({ pick: this.place(event) });
+  }
+
+  move(event) {
+    this.moveRing(event);
+    if (this.held === "brush") {
+      const all = event.getCoalescedEvents?.() ?? [];
+      this.pressure = event.pointerType === "pen" ? event.pressure : 1;
+      this.paint((all.length ? all : [event]).map((one) => this.sample(one, 1)));
+    } else if (this.held === "orbit" || this.held === "light") {
+      const dx = event.clientX - this.from[0];
+      const dy = event.clientY - this.from[1];
+      this.from = [event.clientX, event.clientY];
+      this.drag(this.held === "light" ? { turn: 0.4 * dx } : { orbit: [-0.4 * dx, 0.4 * dy] });
+    }
+  }
+
+  up(event) {
+    if (this.held === "brush") {
+      const last = this.sample(event, 2);
+      last[2] = this.pressure; // a pen that is lifted presses no more
+      this.paint([last]);
+    } else if (this.held === "orbit" || this.held === "light") this.drop();
+    this.held = null;
+  }
+
+  moveRing(event) {
+    const box = this.picture.getBoundingClientRect();
+    const radius = (this.radius.input.value * box.width) / this.picture.width;
+    const [x, y] = [event.clientX - box.left - radius, event.clientY - box.top - radius];
+    this.ring.style.width = this.ring.style.height = `${2 * radius}px`;
+    this.ring.style.transform = `translate(${x}px, ${y}px)`;
+  }
+
+  paint(samples) {
+    this.link.paint(this.brush(), samples);
+    this.rest();
+  }
+
+  change(header, join = true) {
+    if (this.before && !("before" in header)) this.showBefore(false);
+    this.said.textContent = "";
+    this.link.ask(header, join);
+    this.rest();
+  }
+
+  drag(header) {
+    this.dragging = true;
+    this.change({ ...header, dragging: true });
+  }
+
+  drop() {
+    this.dragging = false;
+    this.change({ dragging: false });
+  }
+
+  showBefore(before) {
+    this.before = before;
+    this.compare.setAttribute("aria-pressed", String(before));
+    this.link.ask({ before }, false);
+  }
+
+  rest() {
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => {
+      if (this.held || this.before || this.dragging) return;
+      if (this.link.flying || this.link.queue.length) this.rest();
+      else if (!this.lossless) this.link.ask({ rest: true });
+    }, RESTS);
+  }
+
+  slide(trait, slider) {
+    const value = Number(slider.input.value);
+    if (!this.sliding) {
+      this.sliding = { trait, part: this.state.part, start: this.state.scores[trait] };
+    }
+    return { part: this.sliding.part, amounts: { [trait]: value - this.sliding.start } };
+  }
+
+  // -- what the session says -----------------------------------------------------------------
+
+  hear(header, buffers) {
+    if (header.kind === "open") this.link.renew();
+    else if (header.kind === "closed") {
+      this.said.textContent = header.refused
+        ? "refused: open the address that the command printed" : "connection lost: trying again";
+    } else if (header.kind === "changed") this.others(header);
+    else if (header.view !== this.view) return;
+    else if (header.kind === "error") {
+      this.said.textContent = header.message;
+      if (header.seq !== null) this.link.answered(header);
+    } else if (header.kind === "frame") {
+      const times = this.link.answered(header); // the next request leaves before this is drawn
+      this.drawing = this.drawing.then(() => this.draw(header, buffers[0], times)).catch((error) => {
+        this.said.textContent = `${error}`;
+      });
+    }
+  }
+
+  others({ by, fraction, ready }) {
+    if (by === this.view) return;
+    if (this.state) Object.assign(this.state, { fraction, ready });
+    if (this.looking) return;
+    this.looking = setTimeout(() => {
+      this.looking = null;
+      if (!this.held && !this.link.flying && !this.link.queue.length) {
+        this.link.ask(this.before ? { before: true } : {});
+        this.rest();
+      }
+    }, OTHERS);
+  }
+
+  async draw(header, buffer, times) {
+    const { format, x, y, w, h } = header;
+    if (this.picture.width !== header.width || this.picture.height !== header.height) {
+      Object.assign(this.picture, { width: header.width, height: header.height });
+    }
+    if (format === "rgb") {
+      const bytes = new Uint8Array(buffer.buffer ?? buffer, buffer.byteOffset ?? 0, 3 * w * h);
+      this.paper.putImageData(new ImageData(opaque(bytes), w, h), x, y);
+    } else if (format !== "none") {
+      const bitmap = await createImageBitmap(new Blob([buffer], { type: `image/${format}` }));
+      this.paper.drawImage(bitmap, x, y);
+      bitmap.close();
+    }
+    this.lossless = format === "png" || (format === "none" && this.lossless);
+    const now = performance.now();
+    this.drawn.push(now);
+    if (this.drawn.length > 240) this.drawn.shift();
+    if (times) {
+      this.last = { ...times, drawn: times.newest === null ? null : now - times.newest };
+      this.times.push({ now, format, ms: header.ms, bytes: buffer?.byteLength ?? 0, ...this.last });
+      if (this.times.length > 5000) this.times.shift();
+    }
+    if (header.parts) this.fill(header);
+    this.update(header.state);
+  }
+
+  fill({ parts, traits, library }) {
+    const options = (select, names) => {
+      const old = select.value;
+      select.replaceChildren(...names.map((name) => make("option", { value: name,
+        textContent: name || "(edited)" })));
+      if (names.includes(old)) select.value = old;
+    };
+    options(this.parts, parts);
+    options(this.library, ["", ...library]);
+    options(this.trait, traits);
+    if (!this.chosen && traits.includes("shiny")) this.trait.value = "shiny";
+    this.chosen = true;
+    this.scores = Object.fromEntries(traits.map((trait) => {
+      const slider = this.range(trait, -0.5, 1.5, 0);
+      slider.input.addEventListener("input", () => {
+        this.change({ slide: { ...this.slide(trait, slider), done: false } });
+      });
+      slider.input.addEventListener("change", () => {
+        this.change({ slide: { ...this.slide(trait, slider), done: true } }, true);
+        this.sliding = null;
+      });
+      return [trait, slider];
+    }));
+    this.sliders.replaceChildren(...traits.map((trait) => make("div", { className: "tb-row" },
+      make("label", { textContent: trait }), this.scores[trait].input, this.scores[trait].output)));
+  }
+
+  update(state) {
+    this.state = state;
+    this.parts.value = state.part;
+    this.library.value = state.material;
+    for (const [trait, { input, output }] of Object.entries(this.scores ?? {})) {
+      if (this.sliding?.trait === trait) continue;
+      input.value = state.scores[trait];
+      output.textContent = state.scores[trait].toFixed(2);
+    }
+    this.undo.disabled = !state.undo;
+    this.redo.disabled = !state.redo;
+    this.exact.disabled = !state.doubtful.length;
+    const lines = state.history.join("\n");
+    if (this.history.textContent !== lines) this.history.textContent = lines;
+    if (state.trouble) this.said.textContent = state.trouble;
+    this.showStatus();
+  }
+
+  showStatus() {
+    if (!this.state) return;
+    const { error, ready, fraction, plausibility, doubtful } = this.state;
+    const now = performance.now();
+    const fps = this.drawn.filter((time) => time > now - 1000).length;
+    const margin = plausibility.gamut_margin;
+    const energy = plausibility.energy_scale;
+    const real = energy < 0.995 ? `lowered to ${(100 * energy).toFixed(0)} % to keep energy`
+      : margin <= 0.001 ? "at the edge of what is known" : "plausible";
+    const share = `${(100 * fraction).toFixed(0)} %`;
+    const text = [
+      `<b>${fps}</b> fps`,
+      this.last?.drawn ? `<b>${this.last.drawn.toFixed(0)}</b> ms to drawn` : "",
+      `<span class="${doubtful.length ? "tb-bad" : ""}">error <b>${
+        error === null ? "?" : (100 * error).toFixed(2)} %</b></span>`,
+      ready ? "" : `<b>draft</b>, preparing ${share}`,
+      `<span class="${energy < 0.995 || margin <= 0.001 ? "tb-bad" : ""}">${real}</span>`,
+    ].filter(Boolean).join(" &middot; ");
+    if (this.status.innerHTML !== text) this.status.innerHTML = text;
+  }
+}
+
+export default {
+  render({ model, el, fill = false }) {
+    const canvas = new Canvas(model, el, fill);
+    return () => canvas.end();
+  },
+};

@@ -1,0 +1,202 @@
+"""The live canvas as a page on this machine: `canvas.js` over one WebSocket for each tab.
+
+Any page that a browser shows may open sockets to this machine. So whoever wants the page or the
+socket has to know a token, which is drawn anew for every server, and the socket has to be opened
+by the page itself (its Origin).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import secrets
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from traitbrdf.studio.session import LARGEST, Header, Session
+
+_HERE = Path(__file__).parent
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+def pack(header: Header, buffers: list[bytes]) -> bytes:
+    """One message of the socket: the header's length (uint32, little endian), the header as JSON
+    in UTF-8, and the buffer."""
+    text = json.dumps(header, allow_nan=False).encode()
+    return b"".join([struct.pack("<I", len(text)), text, *buffers])
+
+
+def unpack(message: bytes) -> tuple[object, list[bytes]]:
+    """Header and buffer of a message.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    if len(message) < 4:
+        raise ValueError(f"message: expected at least 4 bytes, got {len(message)}")
+    (length,) = struct.unpack_from("<I", message)
+    if length > len(message) - 4:
+        raise ValueError(f"message: expected a header of {length} bytes, got {len(message) - 4}")
+    try:
+        header = json.loads(message[4 : 4 + length])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"message: expected a JSON header, got {error}") from None
+    rest = message[4 + length :]
+    return header, [rest] if rest else []
+
+
+def application(session: Session, token: str, origins: Callable[[], set[str]]) -> Starlette:
+    """The page, its modules and its socket.
+
+    Parameters
+    ----------
+    session : Session
+    token : what the page's address and the socket's have to contain as ``?token=``
+    origins : the addresses that the page can have
+    """
+
+    def known(given: str | None) -> bool:
+        return given is not None and hmac.compare_digest(given.encode(), token.encode())
+
+    async def page(request: Request) -> Response:
+        if not known(request.query_params.get("token")):
+            return PlainTextResponse(
+                "Expected the address that `traitbrdf studio` printed: it ends in a token.\n",
+                403,
+                _HEADERS,
+            )
+        return FileResponse(_HERE / "page.html", headers=_HEADERS)
+
+    async def module(request: Request) -> Response:
+        name = request.url.path.lstrip("/")
+        return FileResponse(_HERE / name, headers=_HEADERS, media_type="text/javascript")
+
+    async def channel(websocket: WebSocket) -> None:
+        if not known(websocket.query_params.get("token")) or (
+            websocket.headers.get("origin") not in origins()
+        ):
+            await websocket.close(4403)
+            return
+        await websocket.accept()
+        loop = asyncio.get_running_loop()
+        news: asyncio.Queue[bytes] = asyncio.Queue(maxsize=4)
+
+        def offer(message: bytes) -> None:
+            if news.full():  # what a slow page did not take yet is out of date
+                news.get_nowait()
+            news.put_nowait(message)
+
+        def push(header: Header, buffers: list[bytes]) -> None:
+            with contextlib.suppress(RuntimeError):  # the server is ending
+                loop.call_soon_threadsafe(offer, pack(header, buffers))
+
+        async def pass_on() -> None:
+            while True:
+                await websocket.send_bytes(await news.get())
+
+        end = session.subscribe(push)
+        passing = asyncio.create_task(pass_on())
+        try:
+            while True:
+                message = await websocket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                raw = message.get("bytes")
+                try:
+                    header, buffers = unpack(raw if raw is not None else b"")
+                except ValueError as error:
+                    refusal: Header = {"kind": "error", "view": "", "seq": None}
+                    await websocket.send_bytes(pack(refusal | {"message": str(error)}, []))
+                    continue
+                for reply in await run_in_threadpool(session.handle, header, buffers):
+                    await websocket.send_bytes(pack(*reply))
+        except (WebSocketDisconnect, RuntimeError):  # closed while a reply was under way
+            pass
+        finally:
+            end()
+            passing.cancel()
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+        await run_in_threadpool(session.close)
+
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/canvas.js", module),
+            Route("/page.js", module),
+            WebSocketRoute("/socket", channel),
+        ],
+        lifespan=lifespan,
+    )
+
+
+class Server:
+    """A session's page on 127.0.0.1, until it is stopped.
+
+    Parameters
+    ----------
+    session : Session
+    port : 0 takes any that is free
+
+    Attributes
+    ----------
+    url : the page's address, token included
+    """
+
+    def __init__(self, session: Session, port: int = 0) -> None:
+        self.session = session
+        self.token = secrets.token_urlsafe(24)
+        self._socket = socket.socket()
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._socket.bind(("127.0.0.1", port))
+        except OSError:
+            self._socket.close()
+            raise
+        self.port = int(self._socket.getsockname()[1])
+        self.url = f"http://127.0.0.1:{self.port}/?token={self.token}"
+        hosts = {f"http://{host}:{self.port}" for host in ("127.0.0.1", "localhost")}
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                application(session, self.token, lambda: hosts),
+                log_level="error",
+                access_log=False,
+                ws="websockets-sansio",
+                ws_per_message_deflate=False,
+                ws_max_size=LARGEST,
+                timeout_graceful_shutdown=2,
+            )
+        )
+
+    def run(self) -> None:
+        """Serve until `stop`, or an interruption from the keyboard."""
+        try:
+            self._server.run(sockets=[self._socket])
+        finally:
+            self._socket.close()
+
+    def stop(self) -> None:
+        """End `run`, soon; from any thread."""
+        self._server.should_exit = True

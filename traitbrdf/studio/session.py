@@ -1,0 +1,551 @@
+"""The protocol of the live canvas, and the object that speaks it, without any transport.
+
+Every message is a JSON header and at most one binary buffer. The page sends one request and waits
+for its one reply before it sends the next: whatever the pointer did meanwhile goes into that. So no
+queue can grow, and both sides lag by one frame at most.
+
+Up (page to session). All keys but ``kind`` and ``view`` may be missing.
+
+``{"kind": "hello", "view"}``
+    Asks for everything: names, sizes, a whole frame.
+``{"kind": "input", "view", "seq", ...}`` with samples (n, 4) float32: x, y, pressure, phase
+    ``seq`` is any number; the reply repeats it. Samples are in pixels of the image; pressure is 0
+    to 1; phase 0 is the pen put down, 1 moved, 2 lifted. Further keys, in the order in which they
+    are obeyed:
+
+    - ``part``: the part that is chosen; ``pick`` [x, y]: the part to choose is there
+    - ``brush`` {trait, amount, radius, stay}: of the samples; ``stay`` says that only the part on
+      which a stroke begins is painted
+    - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
+    - ``assign`` {part, material}
+    - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
+      ``dragging`` says that more will follow at once: nothing is prepared until it does not
+    - ``do``: "undo", "redo"
+    - ``save``, ``open``: names of design files in the session's folder
+    - ``before``: show what was there before the first edit
+    - ``exact``: render without the basis what it cannot promise, which takes seconds
+    - ``rest``: the hand rests: a whole frame without loss
+    - ``pad``: follow the reply by a message of 66,000 bytes, which carries it through a slow socket
+
+Down (session to page)
+
+``{"kind": "frame", "view", "seq", "format", "x", "y", "w", "h", "width", "height", "ms", "state",
+...}`` with the pixels that changed
+    ``format`` is "jpeg", "png", "rgb" (3 bytes a pixel) or "none" (nothing changed). ``ms`` are
+    milliseconds spent on "edit", "render" and "encode". ``state`` says what is chosen and possible:
+    see `Session._state`. The reply to a hello also has ``parts``, ``traits`` and ``library``.
+``{"kind": "error", "view", "seq", "message"}``
+    The request was not obeyed, or only in part. The session goes on.
+``{"kind": "pad", "view"}`` with 66,000 bytes that mean nothing
+``{"kind": "changed", "by", "ready", "fraction"}``
+    Pushed to whoever subscribes: another view (``by``) or the preparation changed the picture; ask
+    for it by an empty input when it suits.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from traitbrdf.editing import EditSession
+from traitbrdf.formats import Display, exposure_of, unknown_name
+from traitbrdf.scene import Camera
+from traitbrdf.strokes import Stroke
+from traitbrdf.traits import GROUPS
+
+Header = dict[str, Any]
+Reply = tuple[Header, list[bytes]]
+Push = Callable[[Header, list[bytes]], None]
+
+LARGEST = 1 << 20
+"""Bytes of the largest message that is read."""
+_RAW = 48_000
+"""Bytes of a rectangle that is sent as it is: encoding takes longer."""
+_VIEWS = 32
+"""Views whose last frame is remembered."""
+_SPACING = 0.125
+"""Samples nearer than this share of the brush's radius to the one before are left out."""
+_POINTS = 4096
+"""Points of one stroke; what comes beyond is left out."""
+_PAD = bytes(66_000)
+_CHANGES = {"part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn", "do", "open"}
+"""Keys of requests after which other views may be out of date."""
+
+
+class Session:
+    """One `EditSession` for any number of views; see the module for the protocol.
+
+    Parameters
+    ----------
+    edit : EditSession
+    folder : where designs are saved and opened
+    quality : 1 to 95, of JPEG frames
+
+    Attributes
+    ----------
+    edit : what is shown; opening a design replaces it
+    """
+
+    def __init__(
+        self, edit: EditSession, folder: str | Path | None = None, quality: int = 90
+    ) -> None:
+        self.edit = edit
+        self.folder = Path.cwd() if folder is None else Path(folder)
+        self.quality = quality
+        self._lock = threading.RLock()
+        self._pushes: dict[object, Push] = {}
+        self._sent: dict[str, NDArray[np.float32]] = {}
+        self._stroke: Stroke | None = None
+        self._strength = (0.0, 0.0, 0)  # pixels travelled, sum of pressures, samples
+        self._sliding = False
+        self._mine: object = None  # the edit that the stroke or slider at work replaces
+        self._only: str | None = None  # the part that the stroke at work stays on
+        self._dragging = False
+        self._part = edit.scene.parts[0]
+        self._light: object = None
+        self._display = Display(1.0)
+        self._refiner: threading.Thread | None = None
+        self._closed = False
+        self._fraction = 0.0
+        self._trouble = ""
+
+    # -- transports -----------------------------------------------------------------------------
+
+    def handle(self, header: object, buffers: Sequence[bytes | memoryview] = ()) -> list[Reply]:
+        """The replies to one message. Never raises: what fails is replied."""
+        view, seq = "", None
+        try:
+            if not isinstance(header, Mapping):
+                raise TypeError(f"message: expected an object, got {type(header).__name__}")
+            view, seq = str(header.get("view", ""))[:64], header.get("seq")
+            seq = seq if isinstance(seq, (int, float)) and not isinstance(seq, bool) else None
+            size = sum(len(memoryview(b).cast("B")) for b in buffers)
+            if size > LARGEST:
+                raise ValueError(f"message: expected at most {LARGEST} bytes, got {size}")
+            with self._lock, torch.no_grad():
+                return self._obey(view, seq, header, buffers)
+        except Exception as error:
+            message = f"{error}" if isinstance(error, (ValueError, TypeError)) else f"{error!r}"
+            return [({"kind": "error", "view": view, "seq": seq, "message": message[:500]}, [])]
+
+    def subscribe(self, push: Push) -> Callable[[], None]:
+        """Have `push` called with what changes unasked, from any thread; returns how to end it."""
+        key = object()
+        with self._lock:
+            self._pushes[key] = push
+
+        def end() -> None:
+            with self._lock:
+                self._pushes.pop(key, None)
+
+        return end
+
+    def close(self) -> None:
+        """End what runs behind."""
+        with self._lock:
+            self._closed = True
+            self._pushes.clear()
+        self.edit.cancel()
+        if self._refiner is not None:
+            self._refiner.join(10.0)
+
+    def still(self) -> bytes:
+        """The present frame as PNG: rendered, or drafted where that would take long."""
+        with self._lock, torch.no_grad():
+            edit = self.edit
+            image = edit.render(exact=False) if edit.ready else edit.draft()[0]
+            return _png(self._displayed(image))
+
+    # -- requests -------------------------------------------------------------------------------
+
+    def _obey(
+        self, view: str, seq: float | None, header: Mapping[str, Any], buffers: Sequence[Any]
+    ) -> list[Reply]:
+        kind = header.get("kind")
+        if kind not in ("hello", "input"):
+            raise ValueError(f"kind: expected hello or input, got {kind!r}")
+        start = time.perf_counter()
+        trouble = self._act(view, header, buffers) if kind == "input" else ""
+        edited = time.perf_counter()
+        edit = self.edit
+        ready = edit.ready
+        if not ready:
+            image = edit.draft()[0]
+        elif header.get("before") is True:
+            image = edit.before()
+        else:
+            # what the basis cannot promise is shown as it is while the hand moves: its error stands
+            # beside it, and whoever asks for it gets it exactly
+            image = edit.render(exact=header.get("exact") is True)
+        rendered = time.perf_counter()
+        whole = kind == "hello" or header.get("rest") is True
+        reply, pixels = self._encoded(view, image, whole, header.get("rest") is True)
+        done = time.perf_counter()
+        reply |= {"kind": "frame", "view": view, "seq": seq, "state": self._state()}
+        reply["ms"] = {
+            "edit": round(1e3 * (edited - start), 2),
+            "render": round(1e3 * (rendered - edited), 2),
+            "encode": round(1e3 * (done - rendered), 2),
+        }
+        if kind == "hello":
+            reply["parts"] = list(edit.scene.parts)
+            reply["traits"] = list(edit.traits.names)
+            reply["library"] = list(edit.library.names)
+        self._dragging = header.get("dragging") is True
+        if not ready and not self._dragging:
+            self._refine()
+        if _CHANGES.intersection(header):
+            self._tell(view)
+        replies: list[Reply] = [(reply, [pixels] if pixels else [])]
+        if trouble:
+            replies.insert(
+                0, ({"kind": "error", "view": view, "seq": None, "message": trouble}, [])
+            )
+        if header.get("pad") is True:
+            replies.append(({"kind": "pad", "view": view}, [_PAD]))
+        return replies
+
+    def _act(self, view: str, header: Mapping[str, Any], buffers: Sequence[Any]) -> str:
+        """Obey all of an input that can be obeyed; what failed, in words."""
+        failed = []
+        for key, act in (
+            ("part", self._choose),
+            ("pick", self._pick),
+            ("brush", lambda brush: self._paint(brush, buffers)),
+            ("slide", self._slide),
+            ("assign", self._assign),
+            ("orbit", lambda _: self._look(header)),
+            ("zoom", lambda _: None if "orbit" in header else self._look(header)),
+            ("turn", self._turn),
+            ("do", self._do),
+            ("save", self._save),
+            ("open", self._open),
+        ):
+            if key in header:
+                try:
+                    act(header[key])
+                except Exception as error:
+                    failed.append(f"{key}: {error}")
+                    if key in ("brush", "slide"):
+                        self._stroke, self._sliding = None, False
+        return "; ".join(failed)[:500]
+
+    def _choose(self, part: object) -> None:
+        if not isinstance(part, str):
+            raise TypeError(f"expected a name, got {part!r}")
+        self.edit.part(part)
+        self._part = part
+
+    def _pick(self, place: object) -> None:
+        x, y = (math.floor(v) for v in _numbers(place, 2))
+        scene = self.edit.scene
+        if 0 <= x < scene.width and 0 <= y < scene.height:
+            found = int(scene.part_image[y, x])
+            if found >= 0:
+                self._part = scene.parts[found]
+
+    def _paint(self, brush: object, buffers: Sequence[Any]) -> None:
+        if not isinstance(brush, Mapping):
+            raise TypeError(f"expected an object, got {brush!r}")
+        raw = bytes(buffers[0]) if buffers else b""
+        if len(raw) % 16:
+            raise ValueError(f"expected samples of 16 bytes each, got {len(raw)} bytes")
+        samples = np.frombuffer(raw, "<f4").reshape(-1, 4).astype(np.float64)
+        if not np.isfinite(samples).all():
+            raise ValueError("expected samples of finite numbers")
+        (radius,), (amount,) = (
+            _numbers([brush.get("radius")], 1),
+            _numbers([brush.get("amount")], 1),
+        )
+        # one stroke ends where the next begins, however many lie in one message
+        for run in np.split(samples, np.flatnonzero(samples[:, 3] == 0.0)):
+            if not len(run):
+                continue
+            if run[0, 3] == 0.0:
+                self._give_up()
+                self._strength = (0.0, 0.0, 0)
+            elif self._stroke is None:
+                continue  # of a stroke that was given up
+            self._continue(run, brush.get("trait"), amount, radius, brush.get("stay") is True)
+            if (run[:, 3] == 2.0).any():
+                self._stroke = None
+
+    def _continue(
+        self, run: NDArray[np.float64], trait: Any, amount: float, radius: float, stay: bool
+    ) -> None:
+        """The stroke so far is one edit: it replaces what it was before."""
+        kept: list[tuple[float, float]] = []
+        known = self._stroke
+        travelled, pressed, count = self._strength
+        last = None if known is None else known.points[-1]
+        room = _POINTS - (0 if known is None else len(known.points))
+        for x, y, pressure, _ in run:
+            step = 0.0 if last is None else math.hypot(x - last[0], y - last[1])
+            if last is None or step >= _SPACING * radius:
+                if len(kept) >= room:
+                    break
+                kept.append((float(x), float(y)))
+                travelled += step
+                last = kept[-1]
+            pressed += min(max(float(pressure), 0.0), 1.0)
+            count += 1
+        # a dab gives a third of the amount, two radii of the brush all of it
+        share = min(1.0, (1.0 + travelled / radius) / 3.0) if radius > 0.0 else 1.0
+        whole = amount * share * pressed / max(count, 1)
+        if known is None:
+            stroke = Stroke(kept, trait, whole, radius)
+        else:
+            stroke = known.extended(kept, whole)
+            self._take_back()
+        self._stroke, self._strength = stroke, (travelled, pressed, count)
+        scene = self.edit.scene
+        parts = scene.part_image[stroke.coverage(scene.height, scene.width) > 0.0]
+        parts = parts[parts >= 0]
+        if not len(parts):
+            return
+        if stay and self._only is None:  # what lies under the pen, or most of the brush
+            x, y = (math.floor(v) for v in stroke.points[-1])
+            inside = 0 <= x < scene.width and 0 <= y < scene.height
+            under = int(scene.part_image[y, x]) if inside else -1
+            self._only = scene.parts[under if under >= 0 else int(np.bincount(parts).argmax())]
+        self.edit.paint(stroke, self._only)
+        self._mine = self.edit.last
+        self._part = self._only or self._part
+
+    def _take_back(self) -> None:
+        """Undo what the stroke or slider at work did so far, unless something else came since."""
+        if self._mine is not None and self.edit.last is self._mine:
+            self.edit.undo()
+        self._mine = None
+
+    def _slide(self, slide: object) -> None:
+        if not isinstance(slide, Mapping) or not isinstance(slide.get("amounts"), Mapping):
+            raise TypeError(f"expected an object with amounts, got {slide!r}")
+        part, amounts = str(slide.get("part")), slide["amounts"]
+        values = dict(zip(amounts, _numbers(list(amounts.values()), len(amounts)), strict=True))
+        if self._sliding:
+            self._take_back()
+        self._sliding = False
+        hold = () if set(amounts) & set(GROUPS["colour"]) else ("colour",)
+        self.edit.move(part, hold, **values)
+        self._mine = self.edit.last
+        self._sliding = slide.get("done") is not True
+
+    def _assign(self, assign: object) -> None:
+        if not isinstance(assign, Mapping):
+            raise TypeError(f"expected an object, got {assign!r}")
+        self.edit.assign(str(assign.get("part")), str(assign.get("material")))
+
+    def _look(self, header: Mapping[str, Any]) -> None:
+        camera = self.edit.scene.camera
+        right, up = _numbers(header.get("orbit", (0.0, 0.0)), 2)
+        (zoom,) = _numbers([header.get("zoom", 1.0)], 1)
+        self._give_up()
+        self.edit.look(
+            Camera(
+                (camera.azimuth + right + 180.0) % 360.0 - 180.0,
+                min(max(camera.elevation + up, -89.0), 89.0),
+                camera.fov,
+                min(max(camera.zoom * zoom, 0.2), 10.0),
+                camera.target,
+            )
+        )
+
+    def _turn(self, degrees: object) -> None:
+        (angle,) = _numbers([degrees], 1)
+        self._give_up()
+        self.edit.look(rotation=self.edit.scene.environment.rotation + math.radians(angle))
+
+    def _give_up(self) -> None:
+        """A stroke or a slider does not outlive what it was begun on: what it did stays."""
+        self._stroke, self._sliding, self._mine, self._only = None, False, None, None
+
+    def _do(self, what: object) -> None:
+        self._give_up()
+        if what not in ("undo", "redo"):
+            raise ValueError(f"expected undo or redo, got {what!r}")
+        if what == "undo":
+            self.edit.undo()
+        else:
+            self.edit.redo()
+
+    def _file(self, name: object) -> Path:
+        """A design in the folder: what a page says names no other place."""
+        if not isinstance(name, str) or not name or name.startswith("."):
+            raise ValueError(f"expected the name of a file, got {name!r}")
+        if any(c in name for c in "/\\:\0") or len(name) > 100:
+            raise ValueError(f"expected a name in {self.folder}, without a path, got {name!r}")
+        return self.folder / (name if name.endswith(".tbr") else f"{name}.tbr")
+
+    def _save(self, name: object) -> None:
+        self.edit.save(self._file(name))
+
+    def _open(self, name: object) -> None:
+        path = self._file(name)
+        if not path.is_file():
+            known = sorted(p.name for p in self.folder.glob("*.tbr"))
+            raise ValueError(unknown_name("design", path.name, known))
+        old = self.edit
+        self.edit = EditSession.load(
+            path, library=old.library, traits=old.traits, quality=old.quality, error=old.error,
+            device=old.device, seed=old.seed,
+        )  # fmt: skip
+        old.cancel()
+        self._give_up()
+        self._light = None
+        if self._part not in self.edit.scene.parts:
+            self._part = self.edit.scene.parts[0]
+
+    # -- replies --------------------------------------------------------------------------------
+
+    def _state(self) -> Header:
+        """What is chosen and possible: for controls, and for what has to be in view always."""
+        edit = self.edit
+        ready = edit.ready
+        known = edit.history
+        return {
+            "part": self._part,
+            "material": edit.material(self._part).name or "",
+            "scores": {name: round(s, 4) for name, s in edit.scores(self._part).items()},
+            "plausibility": {k: round(v, 4) for k, v in edit.plausibility(self._part).items()},
+            "undo": edit.undoable,
+            "redo": edit.redoable,
+            "edits": len(known),
+            "history": [_shortened(line) for line in known[-6:]],
+            "ready": ready,
+            "fraction": 1.0 if ready else round(self._fraction, 3),
+            "error": edit.frame_error if ready else edit.draft()[1],
+            "doubtful": edit.doubtful if ready else [],
+            "trouble": self._trouble,
+        }
+
+    def _displayed(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
+        light = self.edit.scene.environment
+        if self._light is not light.image:  # one exposure while the light stays: edits are seen
+            self._light, self._display = light.image, Display(exposure_of(image))
+            self._sent.clear()
+        return self._display(image)
+
+    def _encoded(
+        self, view: str, image: NDArray[np.float32], whole: bool, lossless: bool
+    ) -> tuple[Header, bytes]:
+        """What a view does not show yet, as a rectangle."""
+        height, width = image.shape[:2]
+        if self._light is not self.edit.scene.environment.image:
+            self._displayed(image)
+        old = None if whole else self._sent.get(view)
+        box = _difference(old, image) if old is not None else (0, height, 0, width)
+        self._sent.pop(view, None)
+        self._sent[view] = image
+        while len(self._sent) > _VIEWS:
+            self._sent.pop(next(iter(self._sent)))
+        y0, y1, x0, x1 = box
+        size = {"x": x0, "y": y0, "w": x1 - x0, "h": y1 - y0, "width": width, "height": height}
+        if y0 >= y1:
+            return {"format": "none", **size}, b""
+        pixels = self._displayed(np.ascontiguousarray(image[y0:y1, x0:x1]))
+        if lossless:
+            return {"format": "png", **size}, _png(pixels)
+        if pixels.nbytes <= _RAW:
+            return {"format": "rgb", **size}, pixels.tobytes()
+        out = io.BytesIO()
+        Image.fromarray(pixels).save(out, "JPEG", quality=self.quality, subsampling=0)
+        return {"format": "jpeg", **size}, out.getvalue()
+
+    # -- what happens unasked -------------------------------------------------------------------
+
+    def _tell(self, by: str) -> None:
+        news = {
+            "kind": "changed", "by": by, "ready": self.edit.ready,
+            "fraction": round(self._fraction, 3),
+        }  # fmt: skip
+        for push in list(self._pushes.values()):
+            try:
+                push(dict(news), [])
+            except Exception:  # a view that is gone: its transport ends the subscription
+                continue
+
+    def _refine(self) -> None:
+        """Have the view prepared behind, and tell when it has come on."""
+        if self._closed or (self._refiner is not None and self._refiner.is_alive()):
+            return
+        self._trouble = ""
+        self._fraction = 0.0
+        self._refiner = threading.Thread(target=self._prepare, name="traitbrdf-studio", daemon=True)
+        self._refiner.start()
+
+    def _prepare(self) -> None:
+        """Until what is shown is prepared, or cannot be."""
+        while not self._closed:
+            if self._dragging:  # the next view replaces this one at once
+                time.sleep(0.05)
+                continue
+            edit = self.edit
+            try:
+                for _, _, fraction in edit.frames():
+                    self._fraction = fraction
+                    self._tell("")
+                    if self.edit is not edit or self._closed or self._dragging:
+                        break
+            except CancelledError:
+                pass
+            except Exception as error:
+                self._trouble = f"{error}"[:500]
+                self._tell("")
+                return
+            with self._lock:
+                if self.edit is edit and (edit.ready or self._closed):
+                    self._refiner = None
+                    return
+
+
+def _shortened(line: str) -> str:
+    """A line of the history in which long strokes are told by their number of points."""
+    start, _, rest = line.partition("Stroke([")
+    points, close, end = rest.partition("], trait=")
+    if not close or points.count("(") <= 2:
+        return line if len(line) < 160 else f"{line[:150]} ..."
+    return f"{start}Stroke(<{points.count('(')} points>, trait={end}"
+
+
+def _numbers(values: object, count: int) -> list[float]:
+    """Finite numbers of a message."""
+    if not isinstance(values, (list, tuple)) or len(values) != count:
+        raise ValueError(f"expected {count} numbers, got {values!r}")
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"expected a number, got {value!r}")
+        if not math.isfinite(value) or abs(value) > 1e6:
+            raise ValueError(f"expected a finite number, got {value!r}")
+    return [float(value) for value in values]
+
+
+def _difference(old: NDArray[np.float32], new: NDArray[np.float32]) -> tuple[int, int, int, int]:
+    """Rows and columns within which two images (H, W, 3) differ; none where they do not."""
+    height, width = new.shape[:2]
+    if old.shape != new.shape:
+        return 0, height, 0, width
+    unlike = old.reshape(height, -1) != new.reshape(height, -1)
+    rows = np.flatnonzero(unlike.any(axis=1))
+    if not len(rows):
+        return 0, 0, 0, 0
+    y0, y1 = int(rows[0]), int(rows[-1]) + 1
+    columns = np.flatnonzero(unlike[y0:y1].any(axis=0))
+    return y0, y1, int(columns[0]) // 3, int(columns[-1]) // 3 + 1
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, "PNG", compress_level=1)
+    return out.getvalue()
