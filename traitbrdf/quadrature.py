@@ -63,7 +63,7 @@ _CUT = (0.09, 1 / 500)
 _BEND = (0.003, 0.06)
 """Most that a half vector departs, seen against the normal, from those of its cell's corners:
 from their mean, and from any."""
-_UNEVEN = 0.02
+_UNEVEN = 0.005
 """Most that a cell's corners differ in what light they see: see `_disagreement`."""
 _QUESTIONS = 192
 """Most rays of its own that a sample casts at occluders' outlines."""
