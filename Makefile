@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: venv peers demo test lint types unit notebooks bench library clean
+.PHONY: venv peers browser demo test lint types unit live notebooks bench library clean
 
 venv: $(STAMP)
 
@@ -19,11 +19,20 @@ $(STAMP): pyproject.toml
 peers: venv
 	$(BIN)/python -m pip install --quiet --editable ".[peers]"
 
+# A browser and JupyterLab for tests/test_browser.py, where they can be installed.
+browser: venv
+	$(BIN)/python -m pip install --quiet --editable ".[browser]" \
+		|| echo "make: no playwright or jupyterlab: the browser tests are skipped"
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+		&& apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
+		apt-get install -y -qq --no-install-recommends chromium >/dev/null; } \
+		|| echo "make: no chromium: the browser tests are skipped"
+
 # Paint "shiny" on the teapot's handle: pictures and report.json go to out/demo.
 demo: venv
 	$(BIN)/traitbrdf demo --out out/demo
 
-test: lint types unit
+test: lint types browser unit
 
 lint: venv
 	$(BIN)/ruff check .
@@ -37,6 +46,10 @@ unit: venv
 
 bench: venv
 	$(BIN)/traitbrdf bench
+
+# Paint in the page and in JupyterLab by a browser: frames a second, latency, and screenshots.
+live: browser
+	$(BIN)/python tests/bench/live.py --out out/live
 
 # Rebuild the artifact that the package ships.
 library: venv

@@ -370,6 +370,7 @@ class Canvas {
   }
 
   paint(samples) {
+    this.lossless = false;
     this.link.paint(this.brush(), samples);
     this.rest();
   }
@@ -377,6 +378,7 @@ class Canvas {
   change(header, join = true) {
     if (this.before && !("before" in header)) this.showBefore(false);
     this.said.textContent = "";
+    this.lossless = false;
     this.link.ask(header, join);
     this.rest();
   }
@@ -436,6 +438,7 @@ class Canvas {
 
   others({ by, fraction, ready }) {
     if (by === this.view) return;
+    this.lossless = false; // what is seen is out of date
     if (this.state) Object.assign(this.state, { fraction, ready });
     if (this.looking) return;
     this.looking = setTimeout(() => {
@@ -469,7 +472,10 @@ class Canvas {
       this.times.push({ now, format, ms: header.ms, bytes: buffer?.byteLength ?? 0, ...this.last });
       if (this.times.length > 5000) this.times.shift();
     }
-    if (header.parts) this.fill(header);
+    if (header.parts) {
+      this.fill(header);
+      this.rest();
+    }
     this.update(header.state);
   }
 

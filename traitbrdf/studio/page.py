@@ -172,6 +172,7 @@ class Server:
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind(("127.0.0.1", port))
+            self._socket.listen(64)  # who comes before `run` waits
         except OSError:
             self._socket.close()
             raise

@@ -1,0 +1,249 @@
+"""Painting in a browser: frames a second, and from the pointer to the drawn canvas.
+
+``python tests/bench/live.py --out out/live`` drives Debian's chromium through its DevTools, without
+anything between: the page of `traitbrdf studio`, then a real JupyterLab, 512x512 teapot with
+shadows. It prints what the canvas itself measured while a hand painted at 125 Hz, and leaves a
+screenshot of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import contextlib
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.sync.client import connect
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from chrome import CHROMIUM, FLAGS, KERNEL_IDLE, RUN_ALL, STUDIO, jupyter_lab, write_notebook
+
+import traitbrdf as tb
+from traitbrdf.bench import default_data
+from traitbrdf.strokes import follow
+from traitbrdf.studio.page import Server
+from traitbrdf.studio.session import Session
+
+SECONDS = 8.0
+RATE = 125.0
+
+
+class Tab:
+    """One tab of a chromium, by its DevTools' socket."""
+
+    def __init__(self, port: int, address: str) -> None:
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/json/new?{address}", method="PUT"
+        )
+        with urllib.request.urlopen(request) as answer:
+            target = json.load(answer)
+        self._socket = connect(target["webSocketDebuggerUrl"], max_size=None)
+        self._count = itertools.count(1)
+        self.ask("Page.enable")
+        self.ask("Emulation.setFocusEmulationEnabled", enabled=True)
+
+    def tell(self, method: str, **arguments: Any) -> int:
+        number = next(self._count)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": arguments}))
+        return number
+
+    def ask(self, method: str, **arguments: Any) -> Any:
+        number = self.tell(method, **arguments)
+        while True:
+            message = json.loads(self._socket.recv())
+            if message.get("id") == number:
+                if "error" in message:
+                    raise RuntimeError(f"{method}: {message['error']}")
+                return message["result"]
+
+    def evaluate(self, expression: str) -> Any:
+        result = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
+        if "exceptionDetails" in result:
+            raise RuntimeError(f"{expression}: {result['exceptionDetails']}")
+        return result["result"].get("value")
+
+    def until(self, expression: str, seconds: float = 180.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not self.evaluate(f"!!({expression})"):
+            if time.monotonic() > deadline:
+                raise TimeoutError(expression)
+            time.sleep(0.1)
+
+    def screenshot(self, path: Path) -> None:
+        picture = self.ask("Page.captureScreenshot", format="png")
+        path.write_bytes(base64.b64decode(picture["data"]))
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[int]:
+    """A headless chromium; yields the port of its DevTools."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:
+        command = [
+            str(CHROMIUM), "--headless=new", *FLAGS, "--remote-debugging-port=0",
+            "--remote-allow-origins=*", f"--user-data-dir={home}", "--window-size=1100,800",
+            "about:blank",
+        ]  # fmt: skip
+        browser = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            port = Path(home) / "DevToolsActivePort"
+            for _ in range(300):
+                if port.exists() and port.read_text().strip():
+                    break
+                time.sleep(0.1)
+            yield int(port.read_text().split()[0])
+        finally:
+            browser.terminate()
+            browser.wait(20)
+
+
+def scene() -> tb.Scene:
+    data = default_data()
+    environment = (
+        tb.EnvironmentMap.sky()
+        if data is None
+        else tb.EnvironmentMap.read(data / "envmaps" / "forest.exr")
+    )
+    camera = tb.Camera.orbit(-35, 20, zoom=1.05)
+    return tb.Scene(tb.teapot(), environment, camera=camera, size=512, ground=True)
+
+
+CELL = """import sys
+import traitbrdf as tb
+sys.path.insert(0, {folder!r})
+from live import scene
+edit = tb.EditSession(scene())
+edit.assign(list(edit.scene.shape.parts), "blue-plastic")
+edit.prepare()
+tb.studio(edit)"""
+
+
+def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
+    """Strokes to and fro along a path for some seconds; what the canvas measured meanwhile."""
+    tab.until(f"{STUDIO}?.state?.ready")
+    tab.evaluate(f"{STUDIO}.root.scrollIntoView()")
+    time.sleep(1.0)
+    box = tab.evaluate(
+        "(() => { const b = document.querySelector('.tb canvas').getBoundingClientRect();"
+        " return [b.left, b.top, b.width / document.querySelector('.tb canvas').width]; })()"
+    )
+    tab.evaluate(f"{STUDIO}.times.length = 0, {STUDIO}.radius.input.value = 12")
+
+    def place(index: int) -> dict[str, float]:
+        # to the path's end and back, again and again
+        at = index % (2 * len(path) - 2)
+        x, y = path[at if at < len(path) else 2 * len(path) - 2 - at]
+        return {"x": box[0] + x * box[2], "y": box[1] + y * box[2]}
+
+    start = time.perf_counter()
+    index, held = 0, False
+    while (now := time.perf_counter() - start) < SECONDS:
+        fresh = index % 32 == 0  # a new stroke about every quarter of a second
+        if fresh and held:
+            tab.tell("Input.dispatchMouseEvent", type="mouseReleased", button="left",
+                     clickCount=1, **place(index))  # fmt: skip
+        if fresh:
+            sign = 1 if (index // 32) % 2 else -1
+            tab.tell("Runtime.evaluate",
+                     expression=f"{STUDIO}.amount.input.value = {0.6 * sign}")  # fmt: skip
+            tab.tell("Input.dispatchMouseEvent", type="mousePressed", button="left",
+                     clickCount=1, **place(index))  # fmt: skip
+            held = True
+        else:
+            tab.tell("Input.dispatchMouseEvent", type="mouseMoved", button="left", buttons=1,
+                     **place(index))  # fmt: skip
+        index += 1
+        time.sleep(max(0.0, index / RATE - now))
+    tab.ask("Input.dispatchMouseEvent", type="mouseReleased", button="left", clickCount=1,
+            **place(index))  # fmt: skip
+    times = tab.evaluate(
+        f"{STUDIO}.times.filter(t => t.drawn !== null).map(t => [t.now, t.drawn, t.trip, t.work,"
+        " t.format === 'none' ? 0 : 1, t.bytes])"
+    )
+    rows = np.array(times)[5:]  # the first ones warm up
+    shown = rows[rows[:, 4] > 0]
+    return {
+        "fps": (len(shown) - 1) / (shown[-1, 0] - shown[0, 0]) * 1e3,
+        "drawn": float(np.median(shown[:, 1])),
+        "late": float(np.quantile(shown[:, 1], 0.95)),
+        "trip": float(np.median(rows[:, 2])),
+        "work": float(np.median(rows[:, 3])),
+        "kilobytes": float(np.median(shown[:, 5])) / 1e3,
+        "error": float(tab.evaluate(f"{STUDIO}.state.error")),
+        "padded": bool(tab.evaluate(f"{STUDIO}.link.pad")),
+    }
+
+
+def tell(name: str, found: dict[str, float], fps: float, drawn: float) -> None:
+    met = "met" if found["fps"] >= fps and found["drawn"] <= drawn else "MISSED"
+    print(
+        f"{name:11s} {found['fps']:5.1f} fps (asked {fps:.0f}), newest sample to drawn "
+        f"{found['drawn']:.1f} ms median (asked {drawn:.0f}), {found['late']:.1f} ms at the 95th "
+        f"percentile: {met}; round trip {found['trip']:.1f} ms, of which work {found['work']:.1f}; "
+        f"{found['kilobytes']:.0f} kB a frame, frame error {100 * found['error']:.2f} %"
+        + (", padded" if found["padded"] else ""),
+        flush=True,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("out/live"))
+    given = parser.parse_args()
+    if CHROMIUM is None:
+        print("live: chromium is not installed", file=sys.stderr)
+        return 1
+    given.out.mkdir(parents=True, exist_ok=True)
+    edit = tb.EditSession(scene())
+    edit.assign(list(edit.scene.shape.parts), "blue-plastic")
+    edit.prepare()
+    line, _ = follow(edit.scene.part_image == edit.scene.parts.index("handle"))
+    # about 3 pixels a sample: a hand in a hurry
+    steps = [
+        np.linspace(a, b, max(2, round(math.dist(a, b) / 3.0)), endpoint=False)
+        for a, b in itertools.pairwise(line)
+    ]
+    path = np.concatenate(steps)
+    print(f"512x512 teapot with shadows, {os.cpu_count()} cores, painting for {SECONDS:.0f} s")
+    with chromium() as port:
+        server = Server(Session(edit, given.out))
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        try:
+            tab = Tab(port, server.url)
+            tell("page", paint(tab, path), 60.0, 25.0)
+            time.sleep(1.0)
+            tab.screenshot(given.out / "page.png")
+            tab.evaluate("window.close()")
+        finally:
+            server.stop()
+            thread.join(30.0)
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            cell = CELL.format(folder=str(Path(__file__).parent))
+            write_notebook(Path(folder) / "live.ipynb", cell)
+            with jupyter_lab(Path(folder)) as address:
+                tab = Tab(port, f"{address}/lab/tree/live.ipynb")
+                tab.until(KERNEL_IDLE)
+                tab.evaluate(RUN_ALL)
+                tell("JupyterLab", paint(tab, path), 30.0, 50.0)
+                time.sleep(1.0)
+                tab.screenshot(given.out / "lab.png")
+    print(f"screenshots: {given.out}/page.png and {given.out}/lab.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

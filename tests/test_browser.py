@@ -1,0 +1,232 @@
+"""The live canvas in a real browser: the local page, and a real JupyterLab."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from chrome import CHROMIUM, FLAGS, KERNEL_IDLE, RUN_ALL, STUDIO, jupyter_lab, write_notebook
+
+import traitbrdf as tb
+from traitbrdf import editing
+from traitbrdf.strokes import follow
+from traitbrdf.studio.page import Server
+from traitbrdf.studio.session import Session
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed"),
+    # a browser's driver leaves its pipes to the collector
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+SCENE = (
+    "scene = tb.Scene(tb.teapot(8), tb.EnvironmentMap.sky(rows=32), "
+    "camera=tb.Camera.orbit(-35, 20, zoom=1.05), size=192, ground=True)\n"
+    "edit = tb.EditSession(scene, 'preview', cache=False)\n"
+    "edit.assign(list(scene.shape.parts), 'red-rubber')\n"
+)
+
+
+def example():
+    """The scene that the notebook has as well."""
+    names: dict[str, object] = {"tb": tb}
+    exec(SCENE, names)
+    return names["edit"]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser):
+    context = browser.new_context(viewport={"width": 1100, "height": 800})
+    page = context.new_page()
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    yield page
+    context.close()
+    assert [t for t in troubles if "studio" in t or "canvas" in t] == []
+
+
+class Driver:
+    """A hand, and eyes, on the canvas of a page."""
+
+    def __init__(self, page, scene):
+        self.page, self.scene = page, scene
+
+    def until(self, expression, seconds=120.0):
+        deadline = time.monotonic() + seconds
+        while not self.page.evaluate(f"!!({expression})"):
+            assert time.monotonic() < deadline, f"never: {expression}"
+            time.sleep(0.05)
+
+    def settled(self):
+        """Until all is sent and shown, without loss."""
+        self.until(f"{STUDIO}?.state?.ready")
+        self.until(f"{STUDIO}.lossless && !{STUDIO}.link.flying && !{STUDIO}.link.queue.length")
+
+    def state(self):
+        return self.page.evaluate(f"{STUDIO}.state")
+
+    def pixels(self):
+        self.settled()
+        height, width = self.scene.height, self.scene.width
+        values = self.page.evaluate(
+            f"[...{STUDIO}.paper.getImageData(0, 0, {width}, {height}).data]"
+        )
+        return np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
+
+    def stroke(self, points):
+        box = self.page.locator(".tb canvas").bounding_box()
+        scale = box["width"] / self.scene.width
+        places = [(box["x"] + x * scale, box["y"] + y * scale) for x, y in points]
+        self.page.mouse.move(*places[0])
+        self.page.mouse.down()
+        for place in places[1:]:
+            self.page.mouse.move(*place, steps=3)
+        self.page.mouse.up()
+
+    def press(self, keys):
+        self.page.locator(".tb canvas").hover()
+        self.page.evaluate(f"{STUDIO}.root.focus()")
+        self.page.keyboard.press(keys)
+
+    def edits(self, count):
+        self.until(f"{STUDIO}.state.edits === {count}", 30.0)
+
+
+def along(scene, part):
+    return follow(scene.part_image == scene.parts.index(part))[0]
+
+
+def paint_and_more(driver, folder):
+    """What a designer does, by mouse and keys."""
+    page, scene = driver.page, driver.scene
+    before = driver.pixels()
+    assert driver.state()["edits"] == 1
+    driver.stroke(along(scene, "handle"))
+    driver.edits(2)
+    after = driver.pixels()
+    state = driver.state()
+    assert state["part"] == "handle"
+    assert "only='handle'" in state["history"][-1]
+    inside = np.zeros(scene.height * scene.width, bool)
+    inside[scene.pixels[scene.part_slice(scene.parts.index("handle"))]] = True
+    changed = (before != after).any(axis=-1).reshape(-1)
+    assert changed[inside].mean() > 0.5
+    assert not changed[~inside].any()
+    # a slider of the part that was painted
+    slider = page.locator(".tb-sliders input[aria-label=bright]")
+    slider.fill(f"{min(state['scores']['bright'] + 0.2, 1.5):.2f}")
+    driver.until(f"{STUDIO}.state.scores.bright > {state['scores']['bright'] + 0.03}")
+    driver.settled()
+    assert "edit.move('handle', bright=" in driver.state()["history"][-1]
+    moved = driver.pixels()
+    assert not (moved != after).any(axis=-1).reshape(-1)[~inside].any()
+    # back by keys, and forth
+    count = driver.state()["edits"]
+    for _ in range(count - 1):
+        driver.press("Control+z")
+    driver.edits(1)
+    np.testing.assert_array_equal(driver.pixels(), before)
+    driver.press("Control+Shift+z")
+    driver.edits(2)
+    np.testing.assert_array_equal(driver.pixels(), after)
+    # what was there before is shown, not done
+    driver.press("b")
+    driver.until(f"{STUDIO}.before && !{STUDIO}.link.flying")
+    driver.press("b")
+    driver.until(f"!{STUDIO}.before && !{STUDIO}.link.flying")
+    driver.edits(2)
+    # a design is saved, and opened again
+    page.locator(".tb input[aria-label=file]").fill("mine")
+    page.locator(".tb").get_by_role("button", name="save", exact=True).click()
+    driver.until(f"!{STUDIO}.link.flying && !{STUDIO}.link.queue.length")
+    assert (folder / "mine.tbr").is_file()
+    driver.press("Control+z")
+    driver.edits(1)
+    page.locator(".tb").get_by_role("button", name="open", exact=True).click()
+    driver.edits(2)
+    opened = driver.pixels()
+    assert np.abs(opened.astype(int) - after).mean() < 1.0
+    # the camera turns by dragging, and the new view is prepared
+    page.locator(".tb").get_by_role("button", name="orbit").click()
+    driver.stroke([(60.0, 60.0), (90.0, 60.0)])
+    driver.until(f"!{STUDIO}.state.ready")
+    turned = driver.pixels()
+    assert np.abs(turned.astype(int) - opened).mean() > 2.0
+    assert "fps" in page.locator(".tb-status").inner_text()
+    assert "error" in page.locator(".tb-status").inner_text()
+    return turned
+
+
+def test_the_page(page, tmp_path, training, monkeypatch):
+    monkeypatch.setattr(editing, "_training", lambda library, seed: training)
+    edit = example()
+    session = Session(edit, tmp_path)
+    server = Server(session)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        page.goto(server.url)
+        driver = Driver(page, edit.scene)
+        shown = paint_and_more(driver, tmp_path)
+        page.reload()
+        np.testing.assert_array_equal(driver.pixels(), shown)
+        assert driver.state()["edits"] == 2
+        # a second tab shows the same, and what the first does next
+        second = page.context.new_page()
+        second.goto(server.url)
+        other = Driver(second, edit.scene)
+        np.testing.assert_array_equal(other.pixels(), shown)
+        page.bring_to_front()
+        driver.stroke(along(session.edit.scene, "lid"))
+        driver.edits(3)
+        other.edits(3)
+        np.testing.assert_array_equal(other.pixels(), driver.pixels())
+        second.close()
+        driver.press("Control+z")
+        driver.edits(2)
+        np.testing.assert_array_equal(driver.pixels(), shown)
+        page.screenshot(path=tmp_path / "page.png")
+    finally:
+        server.stop()
+        thread.join(30.0)
+    assert not thread.is_alive()
+    driver.until("document.querySelector('.tb-bad[role=alert]').textContent.includes('connection')")
+
+
+def test_a_wrong_token_is_told(page, tmp_path):
+    edit = tb.EditSession(tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=16))
+    server = Server(Session(edit, tmp_path))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        answer = page.goto(server.url.replace("token=", "token=x"))
+        assert answer.status == 403
+        assert "traitbrdf studio" in page.inner_text("body")
+    finally:
+        server.stop()
+        thread.join(30.0)
+
+
+def test_jupyter_lab(page, tmp_path):
+    pytest.importorskip("jupyterlab", reason="jupyterlab is not installed")
+    write_notebook(tmp_path / "live.ipynb", "import traitbrdf as tb\n" + SCENE, "tb.studio(edit)")
+    with jupyter_lab(tmp_path) as address:
+        page.goto(f"{address}/lab/tree/live.ipynb")
+        driver = Driver(page, example().scene)
+        driver.until(KERNEL_IDLE)
+        page.evaluate(RUN_ALL)
+        paint_and_more(driver, tmp_path)
+        page.screenshot(path=tmp_path / "lab.png")
