@@ -701,7 +701,8 @@ def _edits(
             session.assign(name, nearby())
 
     def moved(name: str) -> Callable[[], None]:
-        amounts = itertools.cycle((0.05, -0.05))
+        # never the same twice: what was shown lately need not be shaded again
+        amounts = ((-1) ** k * (0.05 + 1e-4 * k) for k in itertools.count())
         return lambda: session.move(name, hold=("colour",), shiny=next(amounts))
 
     assert "shiny" in space.names

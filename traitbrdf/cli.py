@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     timing.add_argument(
         "names", nargs="*", metavar="NAME", help=f"of {', '.join(bench.BENCHES)} (default: all)"
     )
-    timing.add_argument("--quick", action="store_true", help="small sizes, under a minute")
+    timing.add_argument("--quick", action="store_true", help="small sizes, some two minutes")
     timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records")
     timing.add_argument(
         "--data", type=Path, help="folder with envmaps/ and rgl/ ($TRAITBRDF_SHARED)"

@@ -920,7 +920,7 @@ def _shadows_agree(
         unlike, visibility.bits, cells, normals[some[first]],
         visibility.toward, visibility.cut.share,
     )  # fmt: skip
-    agree: NDArray[np.bool_] = (unlike < loose * _UNEVEN)[which.reshape(-1)]
+    agree: NDArray[np.bool_] = (unlike < loose**1.5 * _UNEVEN)[which.reshape(-1)]
     if sharp is not None:
         nodes, own = sharp
         for k, node in enumerate(nodes):

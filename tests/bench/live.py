@@ -45,13 +45,21 @@ RATE = 125.0
 class Tab:
     """One tab of a chromium, by its DevTools' socket."""
 
+    def __enter__(self) -> Tab:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._open.close()
+
     def __init__(self, port: int, address: str) -> None:
         request = urllib.request.Request(
             f"http://127.0.0.1:{port}/json/new?{address}", method="PUT"
         )
         with urllib.request.urlopen(request) as answer:
             target = json.load(answer)
-        self._socket = connect(target["webSocketDebuggerUrl"], max_size=None)
+        address = target["webSocketDebuggerUrl"]
+        self._open = contextlib.ExitStack()
+        self._socket = self._open.enter_context(connect(address, max_size=None))
         self._count = itertools.count(1)
         self.ask("Page.enable")
         self.ask("Emulation.setFocusEmulationEnabled", enabled=True)
@@ -140,7 +148,7 @@ def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
         "(() => { const b = document.querySelector('.tb canvas').getBoundingClientRect();"
         " return [b.left, b.top, b.width / document.querySelector('.tb canvas').width]; })()"
     )
-    tab.evaluate(f"{STUDIO}.times.length = 0, {STUDIO}.radius.input.value = 12")
+    tab.evaluate(f"{STUDIO}.times.splice(0), Object.assign({STUDIO}.radius.input, {{value: 60}})")
 
     def place(index: int) -> dict[str, float]:
         # to the path's end and back, again and again
@@ -157,8 +165,8 @@ def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
                      clickCount=1, **place(index))  # fmt: skip
         if fresh:
             sign = 1 if (index // 32) % 2 else -1
-            tab.tell("Runtime.evaluate",
-                     expression=f"{STUDIO}.amount.input.value = {0.6 * sign}")  # fmt: skip
+            amount = f"Object.assign({STUDIO}.amount.input, {{value: {0.6 * sign}}})"
+            tab.tell("Runtime.evaluate", expression=amount)
             tab.tell("Input.dispatchMouseEvent", type="mousePressed", button="left",
                      clickCount=1, **place(index))  # fmt: skip
             held = True
@@ -223,19 +231,21 @@ def main() -> int:
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
-            tab = Tab(port, server.url)
-            tell("page", paint(tab, path), 60.0, 25.0)
-            time.sleep(1.0)
-            tab.screenshot(given.out / "page.png")
-            tab.evaluate("window.close()")
+            with Tab(port, server.url) as tab:
+                tell("page", paint(tab, path), 60.0, 25.0)
+                time.sleep(1.0)
+                tab.screenshot(given.out / "page.png")
+                tab.tell("Page.close")
         finally:
             server.stop()
             thread.join(30.0)
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             cell = CELL.format(folder=str(Path(__file__).parent))
             write_notebook(Path(folder) / "live.ipynb", cell)
-            with jupyter_lab(Path(folder)) as address:
-                tab = Tab(port, f"{address}/lab/tree/live.ipynb")
+            with (
+                jupyter_lab(Path(folder)) as address,
+                Tab(port, f"{address}/lab/tree/live.ipynb") as tab,
+            ):
                 tab.until(KERNEL_IDLE)
                 tab.evaluate(RUN_ALL)
                 tell("JupyterLab", paint(tab, path), 30.0, 50.0)
