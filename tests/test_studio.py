@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -659,9 +660,7 @@ def test_importing_the_package_imports_no_server():
         "import sys, traitbrdf; "
         "print([m for m in ('anywidget', 'starlette', 'uvicorn') if m in sys.modules])"
     )
-    said = subprocess.run(
-        [shutil.which("python") or "python", "-c", code], capture_output=True, text=True, check=True
-    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "[]"
 
 
