@@ -147,7 +147,7 @@ class Operator:
         self._image = environment.image
         scale = 1.0 / resolution
         # sharp lobes are lost where the leaves at their peaks grow wider than these
-        rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.075 * scale, 0.1 * scale])
+        rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
         border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
         # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
         # need leaves of half that size
