@@ -733,6 +733,16 @@ def test_gradients_of_a_ground_have_it_prepared_for_all():
     assert session.prepare().fixed == frozenset()
 
 
+def test_a_ground_that_was_assigned_is_seen_as_it_was_before():
+    session = EditSession(ball_scene(), "preview", error=1.0, cache=False)
+    session.assign("ground", "gold-satin")
+    assert session.prepare().fixed == {1}
+    other = EditSession(session.scene, "preview", error=1.0, cache=False)
+    plain = other.render()
+    np.testing.assert_allclose(session.before(), plain, rtol=0.02, atol=2e-3)
+    assert session.material("ground").name == "gold-satin"
+
+
 def test_an_edit_of_the_ground_while_it_is_prepared(gate):
     """What ends then is not enough: the frame waits for the rest."""
     session = EditSession(ball_scene(12), "preview", progress=gate, cache=False)
@@ -782,7 +792,7 @@ def test_a_design_keeps_ground_shadows_and_texture_coordinates(tmp_path, trainin
     same(again.scene.shape.uvs, mesh.uvs)
     same(again.scene.weights, scene.weights)
     # so that what was prepared for it is found again
-    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0, {}) for s in (session, again)]
+    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0) for s in (session, again)]
     assert keys[0] == keys[1]
 
 
@@ -1459,7 +1469,8 @@ def test_a_key_names_all_that_a_preparation_depends_on():
     scene = ball_scene(lights=[light])
 
     def key(scene=scene, library=LIBRARY, rank=24, resolution=0.7, seed=0, fixed=None):
-        return editing._cache_key(scene, library, rank, resolution, seed, fixed or {})
+        whole = editing._cache_key(scene, library, rank, resolution, seed)
+        return editing._fixed_key(whole, fixed or {})
 
     other = tb.Library(EMBEDDING, LIBRARY.names, LIBRARY.coordinates * 0.99, LIBRARY.families)
     pot = tb.Scene(tb.teapot(), scene.environment, size=8)
@@ -1510,7 +1521,7 @@ def test_a_shape_that_only_knows_itself_is_not_cached(cache):
             return self._shape.occluded(origins, directions, max_distance)
 
     scene = tb.Scene(Own(), tb.EnvironmentMap.sky(rows=16), size=8)
-    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0, {}) is None
+    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0) is None
     EditSession(scene, "preview").prepare()
     written()
     assert not cache.exists()

@@ -154,8 +154,9 @@ def _scene(given: argparse.Namespace, mesh: Shape | None = None) -> tb.Scene:
     environment = (
         tb.EnvironmentMap.sky() if given.env is None else tb.EnvironmentMap.read(given.env)
     )
-    named = tb.teapot() if given.shape == "teapot" else tb.sphere()
-    shape = named if mesh is None else mesh
+    shape = mesh
+    if shape is None:
+        shape = tb.teapot() if given.shape == "teapot" else tb.sphere()
     azimuth, elevation, zoom = given.camera
     if (given.shape == "sphere" or mesh is not None) and tuple(given.camera) == DEMO_CAMERA:
         zoom = 1.0

@@ -125,7 +125,7 @@ class Material:
         return (
             self.name == other.name
             and self.table is other.table
-            and (self.offset is other.offset)
+            and self.offset is other.offset
             and np.array_equal(self.z, other.z)
             and np.array_equal(self.mirror, other.mirror)
         )
@@ -1038,6 +1038,8 @@ class EditSession:
 
     def before(self) -> Float32:
         """The frame (H, W, 3) as it would be without this session's edits; nothing is changed."""
+        # a ground that was assigned had another material before
+        self._edited.update(*(edit.before for edit in self._done))
         with self._prepared() as (view, transport):
             now = dict(self._materials)
             for edit in reversed(self._done):
@@ -1584,10 +1586,10 @@ def _prepare(
     tables = {part: material.values(library.embedding) for part, material in fixed.items()}
     key = None
     if cache is not None:
+        whole = _cache_key(scene, library, rank, resolution, seed)
         # one that serves all edits serves these as well
         for some in ({}, fixed) if fixed else ({},):
-            used = {part: tables[part] for part in some}
-            key = _cache_key(scene, library, rank, resolution, seed, used)
+            key = _fixed_key(whole, {part: tables[part] for part in some})
             arrays = None if key is None else cache.read(key)
             if key is None or arrays is None:
                 continue
@@ -1649,12 +1651,7 @@ def _code() -> str:
 
 
 def _cache_key(
-    scene: Scene,
-    library: Library,
-    rank: int,
-    resolution: float,
-    seed: int,
-    fixed: Mapping[int, Float32],
+    scene: Scene, library: Library, rank: int, resolution: float, seed: int
 ) -> str | None:
     """A name of all that a preparation depends on; None where that cannot be told."""
     shape = scene.shape
@@ -1667,14 +1664,20 @@ def _cache_key(
         return None  # what casts shadows is known to the shape alone
     return _hash(
         _CACHE_FORMAT, _code(), _fingerprint(library.embedding), library.coordinates,
-        rank, resolution, seed, *(x for pair in fixed.items() for x in pair),
-        scene.height, scene.width, scene.parts, scene.casts,
+        rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
         scene.ground, scene.shadows, np.asarray(shape.center), shape.radius, shape.lowest,
         *geometry, scene.environment.image, scene.environment.rotation, scene.lights,
         *(getattr(scene, name) for name in _FRAGMENTS),
         # a mesh that was saved and loaded may differ in the last bit
         *(getattr(scene, name).astype(np.float32) for name in _SAMPLES),
     )  # fmt: skip
+
+
+def _fixed_key(whole: str | None, fixed: Mapping[int, Float32]) -> str | None:
+    """The name of a preparation for the tables of fixed parts, from that of one for all edits."""
+    if whole is None or not fixed:
+        return whole
+    return _hash(whole, *(x for pair in fixed.items() for x in pair))
 
 
 _FRAGMENTS = ("pixels", "pixel_part", "weights", "bordering", "offsets")

@@ -230,7 +230,7 @@ class Transport:
                     f"{table.shape} for part {part}"
                 )
         self._begin(scene, grid, rank, resolution, device)
-        self._compress_groups(training, fixed or {}, (), seed, progress)
+        self._compress_groups(training, fixed or {}, {}, seed, progress)
 
     def freed(
         self, training: Training, seed: int = 0, progress: Progress | None = None
@@ -244,9 +244,11 @@ class Transport:
         if self._operator is not None:  # its own: this one may be in use
             tree = self._operator.tree
             other._operator = Operator(self.scene, self.grid, self.resolution, tree)
-        known = [
-            None if self.fixed.intersection(basis.parts) else replace(basis) for basis in self.bases
-        ]
+        known = {
+            g: replace(basis)
+            for g, basis in enumerate(self.bases)
+            if not self.fixed.intersection(basis.parts)
+        }
         for part in range(len(self.parts)):
             if part not in self.fixed:
                 other.parts[part] = self.parts[part]
@@ -257,11 +259,11 @@ class Transport:
         self,
         training: Training,
         fixed: Mapping[int, Float32],
-        known: Sequence[_Basis | None],
+        known: Mapping[int, _Basis],
         seed: int,
         progress: Progress | None,
     ) -> None:
-        """The bases of all groups, but those that are known."""
+        """The bases of all groups; those that are `known`, by group, are taken as they are."""
         shape = training.tables.shape
         if shape != (self.grid.size, len(training.weight)) or not len(training.weight):
             raise ValueError(
@@ -272,7 +274,6 @@ class Transport:
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
         groups = self._groups()
-        missing = [g for g in range(len(groups)) if g >= len(known) or known[g] is None]
         # the next part's rays are cast while others are shaded
         cancelled, operator = threading.Event(), self.operator
 
@@ -285,9 +286,14 @@ class Transport:
 
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             try:
-                casting = {part: pool.submit(cast, part) for g in missing for part in groups[g]}
+                casting = {
+                    part: pool.submit(cast, part)
+                    for g, group in enumerate(groups)
+                    if g not in known
+                    for part in group
+                }
                 for g, group in enumerate(groups):
-                    basis = None if g in missing else known[g]
+                    basis = known.get(g)
                     if basis is None:
                         rng = np.random.default_rng([seed, g])
                         if fixed.keys() >= set(group):

@@ -165,7 +165,8 @@ class Session:
         with self._lock, torch.no_grad():
             edit = self.edit
             image = edit.render(exact=False) if edit.ready else edit.draft()[0]
-            return _png(self._displayed(image))
+            self._expose(image)
+            return _png(self._display(image))
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -180,8 +181,9 @@ class Session:
         edited = time.perf_counter()
         edit = self.edit
         ready = edit.ready
+        draft_error = None
         if not ready:
-            image = edit.draft()[0]
+            image, draft_error = edit.draft()
         elif header.get("before") is True:
             image = edit.before()
         else:
@@ -192,7 +194,7 @@ class Session:
         whole = kind == "hello" or header.get("rest") is True
         reply, pixels = self._encoded(view, image, whole, header.get("rest") is True)
         done = time.perf_counter()
-        reply |= {"kind": "frame", "view": view, "seq": seq, "state": self._state()}
+        reply |= {"kind": "frame", "view": view, "seq": seq, "state": self._state(draft_error)}
         reply["ms"] = {
             "edit": round(1e3 * (edited - start), 2),
             "render": round(1e3 * (rendered - edited), 2),
@@ -238,7 +240,7 @@ class Session:
                 except Exception as error:
                     failed.append(f"{key}: {error}")
                     if key in ("brush", "slide"):
-                        self._stroke, self._sliding = None, False
+                        self._give_up()
         return "; ".join(failed)[:500]
 
     def _choose(self, part: object) -> None:
@@ -264,10 +266,7 @@ class Session:
         samples = np.frombuffer(raw, "<f4").reshape(-1, 4).astype(np.float64)
         if not np.isfinite(samples).all():
             raise ValueError("expected samples of finite numbers")
-        (radius,), (amount,) = (
-            _numbers([brush.get("radius")], 1),
-            _numbers([brush.get("amount")], 1),
-        )
+        radius, amount = _numbers([brush.get("radius"), brush.get("amount")], 2)
         # one stroke ends where the next begins, however many lie in one message
         for run in np.split(samples, np.flatnonzero(samples[:, 3] == 0.0)):
             if not len(run):
@@ -409,10 +408,10 @@ class Session:
 
     # -- replies --------------------------------------------------------------------------------
 
-    def _state(self) -> Header:
+    def _state(self, draft_error: float | None) -> Header:
         """What is chosen and possible: for controls, and for what has to be in view always."""
         edit = self.edit
-        ready = edit.ready
+        ready = draft_error is None
         known = edit.history
         return {
             "part": self._part,
@@ -425,25 +424,24 @@ class Session:
             "history": [_shortened(line) for line in known[-6:]],
             "ready": ready,
             "fraction": 1.0 if ready else round(self._fraction, 3),
-            "error": edit.frame_error if ready else edit.draft()[1],
+            "error": edit.frame_error if ready else draft_error,
             "doubtful": edit.doubtful if ready else [],
             "trouble": self._trouble,
         }
 
-    def _displayed(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
-        light = self.edit.scene.environment
-        if self._light is not light.image:  # one exposure while the light stays: edits are seen
-            self._light, self._display = light.image, Display(exposure_of(image))
+    def _expose(self, image: NDArray[np.float32]) -> None:
+        """Choose the exposure by an image: one while the light stays, so that edits are seen."""
+        light = self.edit.scene.environment.image
+        if self._light is not light:
+            self._light, self._display = light, Display(exposure_of(image))
             self._sent.clear()
-        return self._display(image)
 
     def _encoded(
         self, view: str, image: NDArray[np.float32], whole: bool, lossless: bool
     ) -> tuple[Header, bytes]:
         """What a view does not show yet, as a rectangle."""
         height, width = image.shape[:2]
-        if self._light is not self.edit.scene.environment.image:
-            self._displayed(image)
+        self._expose(image)
         old = None if whole else self._sent.get(view)
         box = _difference(old, image) if old is not None else (0, height, 0, width)
         self._sent.pop(view, None)
@@ -454,7 +452,7 @@ class Session:
         size = {"x": x0, "y": y0, "w": x1 - x0, "h": y1 - y0, "width": width, "height": height}
         if y0 >= y1:
             return {"format": "none", **size}, b""
-        pixels = self._displayed(np.ascontiguousarray(image[y0:y1, x0:x1]))
+        pixels = self._display(np.ascontiguousarray(image[y0:y1, x0:x1]))
         if lossless:
             return {"format": "png", **size}, _png(pixels)
         if pixels.nbytes <= _RAW:
