@@ -103,7 +103,7 @@ _FAREWELL = 20.0  # seconds that the interpreter's end waits for a cancelled pre
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What one part is made of.
+    """What one part is made of; equal if it is the same reflectance, of the same name.
 
     Attributes
     ----------
@@ -120,15 +120,16 @@ class Material:
     table: Float32 | None = None
     name: str = ""
 
-    def equals(self, other: Material) -> bool:
-        """Whether both are the same reflectance, of the same name."""
-        return (
-            self.name == other.name
-            and self.table is other.table
-            and self.offset is other.offset
-            and np.array_equal(self.z, other.z)
-            and np.array_equal(self.mirror, other.mirror)
-        )
+    @functools.cached_property
+    def _key(self) -> tuple[object, ...]:
+        # tables are large: one that was assigned anew is another
+        return self.name, id(self.table), id(self.offset), self.z.tobytes(), self.mirror.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Material) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
         """f_r (n, 3) at `cells` (n,) of the embedding's grid; at all of them if left out."""
@@ -147,15 +148,17 @@ class _Said:
     """The call that did an edit.
 
     A stroke lies on the image: where the picture has been framed anew since, `anywhere` says the
-    same part by part.
+    same part by part. It is put into words when it is asked for: while it is painted, nobody does.
     """
 
-    call: str
+    call: str | Callable[[], str]
     anywhere: str = ""
     framing: tuple[Camera, int, int] | None = None
 
     def under(self, framing: tuple[Camera, int, int]) -> str:
-        return self.call if not self.anywhere or framing == self.framing else self.anywhere
+        if self.anywhere and framing != self.framing:
+            return self.anywhere
+        return self.call if isinstance(self.call, str) else self.call()
 
 
 @dataclass(frozen=True)
@@ -674,9 +677,7 @@ class EditSession:
         z = self.traits.move(old.z, amounts, hold)
         if np.array_equal(z, old.z):
             return old
-        new = replace(old, z=z, table=None)
-        # what was shown lately is the same material still: it need not be shaded again
-        return next((m for _, m in self._view.kept if m.equals(new)), new)
+        return replace(old, z=z, table=None)
 
     def paint(self, stroke: Stroke, only: str | Iterable[str] | None = None) -> dict[str, float]:
         """Paint a trait on the image: every part under the stroke moves by its share of it.
@@ -732,7 +733,7 @@ class EditSession:
                 alone = f", only={(only[0] if len(only) == 1 else only)!r}"
             self._edited.update(new)
             self._do(new, _Said(
-                f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
+                lambda: f"edit.paint(tb.Stroke({list(stroke.points)!r}, trait={stroke.trait!r}, "
                 f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}){alone})",
                 "; ".join(_move_call(name, {stroke.trait: a}, hold) for name, a in moved.items()),
                 _framing(scene),
@@ -863,7 +864,7 @@ class EditSession:
             return None
         for index, material in known.fixed.items():
             part = view.scene.parts[index]
-            if part in self._edited or self._materials[part] is not material:
+            if part in self._edited or self._materials[part] != material:
                 return None
         return known.transport
 
@@ -974,7 +975,7 @@ class EditSession:
                 scene = view.scene
                 materials = tuple(self._materials[part] for part in scene.parts)
             known = view.drafted
-            if known is None or any(a is not b for a, b in zip(known[0], materials, strict=True)):
+            if known is None or known[0] != materials:
                 with _TURNS.urgent():
                     known = view.drafted = self._draft(view, materials)
             if view is self._view:  # else it is a picture of what was looked at before
@@ -998,7 +999,7 @@ class EditSession:
     def render(self, wait: bool = True, exact: bool = True) -> Float32:
         """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.
 
-        Parts whose material is the same object as at a recent frame are not computed again, and
+        Parts whose material is that of a recent frame are not computed again, and
         only the pixels of those that changed are drawn. The array is the caller's.
 
         Parameters

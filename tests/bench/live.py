@@ -139,6 +139,32 @@ edit.prepare()
 tb.studio(edit)"""
 
 
+def serve() -> None:
+    """The page of a session like that of the notebook; says its address."""
+    edit = tb.EditSession(scene())
+    edit.assign(list(edit.scene.shape.parts), "blue-plastic")
+    edit.prepare()
+    server = Server(Session(edit))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    print(server.url, flush=True)
+    sys.stdin.read()
+    server.stop()
+    thread.join(30.0)
+
+
+@contextlib.contextmanager
+def page() -> Iterator[str]:
+    """`serve` in a process of its own, as a user has it; yields its address."""
+    command = [sys.executable, __file__, "--serve"]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdin is not None and server.stdout is not None
+        yield server.stdout.readline().strip()
+        server.stdin.close()
+
+
 def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
     """Strokes to and fro along a path for some seconds; what the canvas measured meanwhile."""
     tab.until(f"{STUDIO}?.state?.ready")
@@ -210,15 +236,17 @@ def tell(name: str, found: dict[str, float], fps: float, drawn: float) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("out/live"))
+    parser.add_argument("--serve", action="store_true", help="the page alone, until stdin ends")
     given = parser.parse_args()
+    if given.serve:
+        serve()
+        return 0
     if CHROMIUM is None:
         print("live: chromium is not installed", file=sys.stderr)
         return 1
     given.out.mkdir(parents=True, exist_ok=True)
-    edit = tb.EditSession(scene())
-    edit.assign(list(edit.scene.shape.parts), "blue-plastic")
-    edit.prepare()
-    line, _ = follow(edit.scene.part_image == edit.scene.parts.index("handle"))
+    shown = scene()
+    line, _ = follow(shown.part_image == shown.parts.index("handle"))
     # about 3 pixels a sample: a hand in a hurry
     steps = [
         np.linspace(a, b, max(2, round(math.dist(a, b) / 3.0)), endpoint=False)
@@ -227,18 +255,11 @@ def main() -> int:
     path = np.concatenate(steps)
     print(f"512x512 teapot with shadows, {os.cpu_count()} cores, painting for {SECONDS:.0f} s")
     with chromium() as port:
-        server = Server(Session(edit, given.out))
-        thread = threading.Thread(target=server.run)
-        thread.start()
-        try:
-            with Tab(port, server.url) as tab:
-                tell("page", paint(tab, path), 60.0, 25.0)
-                time.sleep(1.0)
-                tab.screenshot(given.out / "page.png")
-                tab.tell("Page.close")
-        finally:
-            server.stop()
-            thread.join(30.0)
+        with page() as address, Tab(port, address) as tab:
+            tell("page", paint(tab, path), 60.0, 25.0)
+            time.sleep(1.0)
+            tab.screenshot(given.out / "page.png")
+            tab.tell("Page.close")
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             cell = CELL.format(folder=str(Path(__file__).parent))
             write_notebook(Path(folder) / "live.ipynb", cell)

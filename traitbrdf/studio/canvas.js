@@ -6,13 +6,16 @@ const CROWD = 8192; // samples of one request, beyond which every other one is l
 const SLOW = 30; // ms of a round trip that no work explains
 const RESTS = 250; // ms until the hand rests
 const OTHERS = 100; // ms between two looks at what other views changed
+const TELLS = 120; // ms between two looks of the hand's owner at figures and sliders
 
 const sameKeys = (a, b) => JSON.stringify(Object.keys(a)) === JSON.stringify(Object.keys(b));
 
 /** One request in flight; what happens meanwhile is put together into the next. */
 export class Link {
-  constructor(view, send, { now = () => performance.now(), later = (act, ms) => setTimeout(act, ms) } = {}) {
-    Object.assign(this, { view, send, now, later });
+  constructor(view, send, {
+    now = () => performance.now(), later = (act, ms) => setTimeout(act, ms), padding = true,
+  } = {}) {
+    Object.assign(this, { view, send, now, later, padding });
     this.queue = []; // of requests that cannot be put together
     this.flying = null;
     this.seq = 0;
@@ -93,7 +96,7 @@ export class Link {
     const trip = this.now() - flown.sent;
     const work = Object.values(header.ms ?? {}).reduce((a, b) => a + b, 0);
     this.slow = header.ms && trip - work > SLOW ? this.slow + 1 : 0;
-    this.pad ||= this.slow >= 4;
+    this.pad ||= this.padding && this.slow >= 4;
     this.pump();
     return { trip, work, newest: flown.newest };
   }
@@ -105,6 +108,16 @@ export class Link {
     this.queue.unshift({ header: { hello: true }, samples: [], newest: null });
     this.pump();
   }
+}
+
+/** An image of the bytes of a file. Blobs are registered with the browser's own process, which takes
+ * milliseconds: where there are decoders, they are spared. */
+async function decoded(data, type) {
+  if (!globalThis.ImageDecoder) return createImageBitmap(new Blob([data], { type }));
+  const decoder = new ImageDecoder({ data, type });
+  const { image } = await decoder.decode();
+  decoder.close();
+  return image;
 }
 
 /** RGBA bytes of RGB ones. */
@@ -121,13 +134,14 @@ export function opaque(rgb) {
 
 const STYLE = `
 .tb { display: flex; flex-wrap: wrap; gap: 16px; color: #ddd; background: #1d1f22; padding: 12px;
-  font: 13px/1.4 system-ui, sans-serif; outline: none; border-radius: 6px; }
-.tb-stage { position: relative; line-height: 0; align-self: flex-start; touch-action: none; }
+  font: 13px/1.4 system-ui, sans-serif; outline: none; border-radius: 6px; contain: content; }
+.tb-stage { position: relative; contain: layout paint; line-height: 0; align-self: flex-start; touch-action: none; }
 .tb-stage canvas { max-width: 100%; background: #000; cursor: none; border-radius: 4px; }
 .tb-stage[data-tool=pick] canvas { cursor: pointer; }
 .tb-stage[data-tool=orbit] canvas, .tb-stage[data-tool=light] canvas { cursor: move; }
-.tb-ring { position: absolute; border: 1.5px solid #fff; border-radius: 50%; pointer-events: none;
-  mix-blend-mode: difference; display: none; left: 0; top: 0; box-sizing: border-box; }
+.tb-ring { position: absolute; border: 1px solid #fff; border-radius: 50%; pointer-events: none;
+  outline: 1px solid #0008; display: none; left: 0; top: 0; box-sizing: border-box;
+  will-change: transform; }
 .tb-stage[data-tool=brush]:hover .tb-ring { display: block; }
 .tb-side { width: 290px; display: flex; flex-direction: column; gap: 8px; }
 .tb-row { display: flex; gap: 6px; align-items: center; }
@@ -170,7 +184,9 @@ class Canvas {
   constructor(model, el, fill) {
     this.model = model;
     this.view = Math.random().toString(36).slice(2);
-    this.link = new Link(this.view, (header, buffers) => model.send(header, undefined, buffers));
+    // our own server does not hold small messages back
+    this.link = new Link(this.view, (header, buffers) => model.send(header, undefined, buffers),
+      { padding: !fill });
     this.tool = "brush";
     this.state = null;
     this.drawn = [];
@@ -186,6 +202,7 @@ class Canvas {
   end() {
     clearInterval(this.clock);
     clearTimeout(this.resting);
+    clearTimeout(this.telling);
     this.model.off("msg:custom", this.listener);
     for (const undo of this.undoing) undo();
   }
@@ -274,6 +291,9 @@ class Canvas {
     on(this.stage, "contextmenu", (event) => event.preventDefault());
     on(this.picture, "pointerdown", (event) => this.down(event));
     on(this.picture, "pointermove", (event) => this.move(event));
+    // where it can be had, the pen is heard at once: "pointermove" waits for the next picture
+    this.raw = "onpointerrawupdate" in this.picture;
+    if (this.raw) on(this.picture, "pointerrawupdate", (event) => this.stroke(event));
     for (const name of ["pointerup", "pointercancel"]) {
       on(this.picture, name, (event) => this.up(event));
     }
@@ -309,7 +329,7 @@ class Canvas {
   }
 
   place(event) {
-    const box = this.picture.getBoundingClientRect();
+    const box = (this.held && this.box) || this.picture.getBoundingClientRect();
     const scale = this.picture.width / box.width;
     return [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale];
   }
@@ -331,6 +351,7 @@ class Canvas {
     const turning = event.button === 2 || this.tool === "orbit";
     this.held = turning ? "orbit" : this.tool;
     this.from = [event.clientX, event.clientY];
+    this.box = this.picture.getBoundingClientRect();
     if (this.before) this.showBefore(false);
     if (this.held === "brush") {
       this.pressure = event.pointerType === "pen" ? event.pressure : 1;
@@ -341,15 +362,20 @@ class Canvas {
   move(event) {
     this.moveRing(event);
     if (this.held === "brush") {
-      const all = event.getCoalescedEvents?.() ?? [];
-      this.pressure = event.pointerType === "pen" ? event.pressure : 1;
-      this.paint((all.length ? all : [event]).map((one) => this.sample(one, 1)));
+      if (!this.raw) this.stroke(event);
     } else if (this.held === "orbit" || this.held === "light") {
       const dx = event.clientX - this.from[0];
       const dy = event.clientY - this.from[1];
       this.from = [event.clientX, event.clientY];
       this.drag(this.held === "light" ? { turn: 0.4 * dx } : { orbit: [-0.4 * dx, 0.4 * dy] });
     }
+  }
+
+  stroke(event) {
+    if (this.held !== "brush") return;
+    const all = event.getCoalescedEvents?.() ?? [];
+    this.pressure = event.pointerType === "pen" ? event.pressure : 1;
+    this.paint((all.length ? all : [event]).map((one) => this.sample(one, 1)));
   }
 
   up(event) {
@@ -362,10 +388,13 @@ class Canvas {
   }
 
   moveRing(event) {
-    const box = this.picture.getBoundingClientRect();
+    const box = this.box = this.picture.getBoundingClientRect();
     const radius = (this.radius.input.value * box.width) / this.picture.width;
     const [x, y] = [event.clientX - box.left - radius, event.clientY - box.top - radius];
-    this.ring.style.width = this.ring.style.height = `${2 * radius}px`;
+    if (this.ringed !== radius) {
+      this.ring.style.width = this.ring.style.height = `${2 * radius}px`;
+      this.ringed = radius;
+    }
     this.ring.style.transform = `translate(${x}px, ${y}px)`;
   }
 
@@ -459,7 +488,7 @@ class Canvas {
       const bytes = new Uint8Array(buffer.buffer ?? buffer, buffer.byteOffset ?? 0, 3 * w * h);
       this.paper.putImageData(new ImageData(opaque(bytes), w, h), x, y);
     } else if (format !== "none") {
-      const bitmap = await createImageBitmap(new Blob([buffer], { type: `image/${format}` }));
+      const bitmap = await decoded(buffer, `image/${format}`);
       this.paper.drawImage(bitmap, x, y);
       bitmap.close();
     }
@@ -507,18 +536,32 @@ class Canvas {
   }
 
   update(state) {
-    this.state = state;
+    this.state = { ...this.state, ...state };
+    if (this.telling) return;
+    const wait = this.held ? this.told + TELLS - performance.now() : 0;
+    if (wait > 0) {
+      this.telling = setTimeout(() => this.tell(), wait);
+    } else this.tell();
+  }
+
+  /** Show what the session said; while the hand moves, seldom: laying the page out takes time. */
+  tell() {
+    this.telling = null;
+    this.told = performance.now();
+    const { state } = this;
     this.parts.value = state.part;
     this.library.value = state.material;
     for (const [trait, { input, output }] of Object.entries(this.scores ?? {})) {
       if (this.sliding?.trait === trait) continue;
+      const score = state.scores[trait].toFixed(2);
+      if (output.textContent === score) continue;
       input.value = state.scores[trait];
-      output.textContent = state.scores[trait].toFixed(2);
+      output.textContent = score;
     }
     this.undo.disabled = !state.undo;
     this.redo.disabled = !state.redo;
     this.exact.disabled = !state.doubtful.length;
-    const lines = state.history.join("\n");
+    const lines = (state.history ?? []).join("\n"); // a stroke is told at its end
     if (this.history.textContent !== lines) this.history.textContent = lines;
     if (state.trouble) this.said.textContent = state.trouble;
     this.showStatus();

@@ -168,7 +168,9 @@ class Server:
     def __init__(self, session: Session, port: int = 0) -> None:
         self.session = session
         self.token = secrets.token_urlsafe(24)
-        self._socket = socket.socket()
+        # named in full, for asyncio lets sockets of TCP alone send small messages at once: else
+        # every frame comes 40 ms late
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind(("127.0.0.1", port))

@@ -70,12 +70,13 @@ Push = Callable[[Header, list[bytes]], None]
 
 LARGEST = 1 << 20
 """Bytes of the largest message that is read."""
-_RAW = 48_000
+_RAW = 200_000
 """Bytes of a rectangle that is sent as it is: encoding takes longer."""
 _VIEWS = 32
 """Views whose last frame is remembered."""
-_SPACING = 0.125
-"""Samples nearer than this share of the brush's radius to the one before are left out."""
+_SPACING = 0.03
+"""Samples nearer than this share of the brush's radius to the one before are left out; nearer than
+half a pixel as well."""
 _POINTS = 4096
 """Points of one stroke; what comes beyond is left out."""
 _PAD = bytes(66_000)
@@ -291,7 +292,7 @@ class Session:
         room = _POINTS - (0 if known is None else len(known.points))
         for x, y, pressure, _ in run:
             step = 0.0 if last is None else math.hypot(x - last[0], y - last[1])
-            if last is None or step >= _SPACING * radius:
+            if last is None or step >= max(0.5, _SPACING * radius):
                 if len(kept) >= room:
                     break
                 kept.append((float(x), float(y)))
@@ -412,7 +413,10 @@ class Session:
         """What is chosen and possible: for controls, and for what has to be in view always."""
         edit = self.edit
         ready = draft_error is None
-        known = edit.history
+        told: Header = {}
+        if self._stroke is None and not self._sliding:  # else it is told once it has ended
+            known = edit.history
+            told = {"edits": len(known), "history": [_shortened(line) for line in known[-6:]]}
         return {
             "part": self._part,
             "material": edit.material(self._part).name or "",
@@ -420,13 +424,12 @@ class Session:
             "plausibility": {k: round(v, 4) for k, v in edit.plausibility(self._part).items()},
             "undo": edit.undoable,
             "redo": edit.redoable,
-            "edits": len(known),
-            "history": [_shortened(line) for line in known[-6:]],
             "ready": ready,
             "fraction": 1.0 if ready else round(self._fraction, 3),
             "error": edit.frame_error if ready else draft_error,
             "doubtful": edit.doubtful if ready else [],
             "trouble": self._trouble,
+            **told,
         }
 
     def _expose(self, image: NDArray[np.float32]) -> None:
