@@ -96,6 +96,20 @@ class Driver:
             self.page.mouse.move(*place, steps=3)
         self.page.mouse.up()
 
+    def pen(self, points, force):
+        """A stroke of a pen that is pressed with `force`."""
+        box = self.page.locator(".tb canvas").bounding_box()
+        scale = box["width"] / self.scene.width
+        tools = self.page.context.new_cdp_session(self.page)
+        kinds = ["mousePressed"] + ["mouseMoved"] * (len(points) - 2) + ["mouseReleased"]
+        for kind, (x, y) in zip(kinds, points, strict=True):
+            tools.send("Input.dispatchMouseEvent", {
+                "type": kind, "x": box["x"] + x * scale, "y": box["y"] + y * scale,
+                "button": "left", "buttons": 1, "clickCount": 1, "pointerType": "pen",
+                "force": force if kind != "mouseReleased" else 0.0,
+            })  # fmt: skip
+        tools.detach()
+
     def press(self, keys):
         self.page.locator(".tb canvas").hover()
         self.page.evaluate(f"{STUDIO}.root.focus()")
@@ -133,6 +147,16 @@ def paint_and_more(driver, folder):
     assert "edit.move('handle', bright=" in driver.state()["history"][-1]
     moved = driver.pixels()
     assert not (moved != after).any(axis=-1).reshape(-1)[~inside].any()
+    # the same slider by the keyboard: no shortcut of whatever is around takes the keys
+    count = driver.state()["edits"]
+    score = driver.state()["scores"]["bright"]
+    slider.focus()
+    for _ in range(8):
+        page.keyboard.press("ArrowDown")
+    driver.until(f"{STUDIO}.state.scores.bright < {score - 0.03}")
+    driver.settled()
+    assert driver.state()["edits"] > count
+    assert driver.state()["part"] == "handle"
     # back by keys, and forth
     count = driver.state()["edits"]
     for _ in range(count - 1):
@@ -165,9 +189,15 @@ def paint_and_more(driver, folder):
     driver.until(f"!{STUDIO}.state.ready")
     turned = driver.pixels()
     assert np.abs(turned.astype(int) - opened).mean() > 2.0
+    # so does the map
+    page.locator(".tb").get_by_role("button", name="light").click()
+    driver.stroke([(60.0, 60.0), (140.0, 60.0)])
+    driver.until(f"!{STUDIO}.state.ready")
+    relit = driver.pixels()
+    assert np.abs(relit.astype(int) - turned).mean() > 1.0
     assert "fps" in page.locator(".tb-status").inner_text()
     assert "error" in page.locator(".tb-status").inner_text()
-    return turned
+    return relit
 
 
 def test_the_page(page, tmp_path, training, monkeypatch):
@@ -184,6 +214,9 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         page.reload()
         np.testing.assert_array_equal(driver.pixels(), shown)
         assert driver.state()["edits"] == 2
+        # the very pixels of the frame
+        frame = session.edit.render(exact=False)
+        np.testing.assert_array_equal(driver.pixels(), session._display(frame))
         # a second tab shows the same, and what the first does next
         second = page.context.new_page()
         second.goto(server.url)
@@ -194,7 +227,38 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         driver.edits(3)
         other.edits(3)
         np.testing.assert_array_equal(other.pixels(), driver.pixels())
+        driver.press("Control+z")
+        driver.edits(2)
+        np.testing.assert_array_equal(driver.pixels(), shown)
+        # a part is picked by a click
+        driver.press("2")
+        x, y = along(session.edit.scene, "spout")[0]
+        driver.stroke([(x, y), (x, y)])
+        driver.until(f"{STUDIO}.state.part === 'spout'")
+        # a pen that is pressed harder does more
+        driver.press("1")
+        line = along(session.edit.scene, "body")
+        amounts = []
+        for force in (0.2, 0.9):
+            driver.pen(line, force)
+            driver.edits(3)
+            amounts.append(session.edit.last.said.call().split("amount=")[1].split(",")[0])
+            driver.press("Control+z")
+            driver.edits(2)
+        assert 0.0 < 3.0 * float(amounts[0]) < float(amounts[1])
+        # a tab that is closed in the middle of a stroke leaves what it painted
+        second.bring_to_front()
+        box = second.locator(".tb canvas").bounding_box()
+        scale = box["width"] / other.scene.width
+        line = along(session.edit.scene, "spout")
+        second.mouse.move(box["x"] + line[0][0] * scale, box["y"] + line[0][1] * scale)
+        second.mouse.down()
+        second.mouse.move(box["x"] + line[-1][0] * scale, box["y"] + line[-1][1] * scale, steps=5)
+        other.until(f"{STUDIO}.times.length && !{STUDIO}.link.flying")
         second.close()
+        page.bring_to_front()
+        driver.edits(3)
+        assert "only='spout'" in driver.state()["history"][-1]
         driver.press("Control+z")
         driver.edits(2)
         np.testing.assert_array_equal(driver.pixels(), shown)
@@ -228,5 +292,10 @@ def test_jupyter_lab(page, tmp_path):
         driver = Driver(page, example().scene)
         driver.until(KERNEL_IDLE)
         page.evaluate(RUN_ALL)
-        paint_and_more(driver, tmp_path)
+        shown = paint_and_more(driver, tmp_path)
         page.screenshot(path=tmp_path / "lab.png")
+        # the kernel remembers what the page forgets
+        page.evaluate("jupyterapp.commands.execute('docmanager:save')")
+        page.reload()
+        np.testing.assert_array_equal(driver.pixels(), shown)
+        assert driver.state()["edits"] == 2

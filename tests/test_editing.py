@@ -1031,21 +1031,28 @@ def test_a_draft_shows_the_frame_at_once(prepared_ball):
     after.assign("sphere", PerfectMirror((0.4, 0.5, 0.6)) + 0.5 * Lambert(0.5))
     frame = after.render()
     assert np.abs(image - frame).mean() < 0.05 * frame.mean()
-    draft = session._view.draft
+    _, draft = session._view.draft
     image[:] = 0.0  # the caller's
     assert session.draft()[0].max() > 0.0
     session.assign("sphere", "red-rubber")
     second, _ = session.draft()
-    assert session._view.draft is draft
+    assert session._view.draft[1] is draft
     assert np.abs(second - frame).mean() > 0.05 * frame.mean()
 
 
-def test_a_draft_is_enlarged_to_the_size_of_the_scene(monkeypatch, prepared_ball):
-    monkeypatch.setattr(editing, "DRAFT_SIZE", 24)
+def test_a_draft_is_enlarged_to_the_size_of_the_scene(prepared_ball):
     session = EditSession(ball_scene(size=(33, 48), ground=False), "preview")
-    image, _ = session.draft()
-    assert image.shape == (33, 48, 3)
-    assert max(session._view.draft.scene.height, session._view.draft.scene.width) == 24
+    for wanted in (12, 24):
+        image, _ = session.draft(wanted)
+        assert image.shape == (33, 48, 3)
+        size, draft = session._view.draft
+        assert size == max(draft.scene.height, draft.scene.width) == wanted
+    same(session.draft(24)[0], image)
+    session.draft()  # as large as the scene: nothing is gained by more
+    assert session._view.draft[1].scene.width == 48
+    for odd in (0, -3, True, 12.5):
+        with pytest.raises(ValueError, match="size: expected a positive number of pixels"):
+            session.draft(odd)
     assert image.flags.c_contiguous
     ramp = np.broadcast_to(np.arange(8, dtype=np.float32)[None, :, None], (4, 8, 3)).copy()
     larger = editing._enlarged(ramp, 8, 16)

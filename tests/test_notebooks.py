@@ -25,6 +25,8 @@ def test_notebook_runs(path: Path) -> None:
     )
     client.execute()  # raises CellExecutionError with the cell's traceback
     shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
-    assert sum("image/png" in o.get("data", {}) for o in shown) == 3
+    assert sum("image/png" in o.get("data", {}) for o in shown) == 4
+    canvas = "application/vnd.jupyter.widget-view+json"
+    assert sum(canvas in o.get("data", {}) for o in shown) == 1
     printed = "".join(o.get("text", "") for o in shown)
     assert "pixels changed beside the handle: 0" in printed

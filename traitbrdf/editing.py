@@ -35,7 +35,7 @@ from dataclasses import dataclass, field, replace
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -431,6 +431,15 @@ class _Canvas:
         return copy
 
 
+class _Drafted(NamedTuple):
+    """A draft's image (h, w, 3) and measured error, and of what it is."""
+
+    size: int
+    materials: tuple[Material, ...]
+    image: Float32
+    error: float
+
+
 @dataclass(eq=False)
 class _View:
     """All that belongs to one scene of the session: the next look replaces it as a whole."""
@@ -446,8 +455,8 @@ class _View:
     budget: dict[int, int] = field(default_factory=dict)
     floor: dict[int, float] = field(default_factory=dict)
     exact_frames: int = 0
-    draft: Draft | None = None
-    drafted: tuple[tuple[Material, ...], Float32, float] | None = None
+    draft: tuple[int, Draft] | None = None
+    drafted: _Drafted | None = None
     times: dict[str, float] = field(default_factory=dict)
 
     def keep(self, index: int, material: Material, shown: _Shown) -> None:
@@ -957,11 +966,16 @@ class EditSession:
                 self._view.job = None
                 job.stop()
 
-    def draft(self) -> tuple[Float32, float]:
+    def draft(self, size: int | None = None) -> tuple[Float32, float]:
         """A first image at once, without any preparation.
 
-        It is rendered at 128 pixels along the longer side and enlarged; the first one of a view
-        takes longer than those after it.
+        It is rendered at a small size and enlarged; the first one of a view takes longer than those
+        after it.
+
+        Parameters
+        ----------
+        size : int
+            Pixels along the longer side of what is rendered; None is 128.
 
         Returns
         -------
@@ -969,32 +983,33 @@ class EditSession:
         error : float
             Mean relative L1 over the small image's covered pixels, measured at some of them.
         """
+        size = DRAFT_SIZE if size is None else size
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
         while True:
             with self._lock:
                 view = self._view
                 scene = view.scene
                 materials = tuple(self._materials[part] for part in scene.parts)
             known = view.drafted
-            if known is None or known[0] != materials:
+            if known is None or known.size != size or known.materials != materials:
                 with _TURNS.urgent():
-                    known = view.drafted = self._draft(view, materials)
+                    known = view.drafted = self._draft(view, materials, size)
             if view is self._view:  # else it is a picture of what was looked at before
-                return _enlarged(known[1], scene.height, scene.width), known[2]
+                return _enlarged(known.image, scene.height, scene.width), known.error
 
-    def _draft(
-        self, view: _View, materials: tuple[Material, ...]
-    ) -> tuple[tuple[Material, ...], Float32, float]:
+    def _draft(self, view: _View, materials: tuple[Material, ...], size: int) -> _Drafted:
         start = time.perf_counter()
-        if view.draft is None:
+        if view.draft is None or view.draft[0] != size:
             tree = self._trees.of(view.scene.environment)
             grid = self.embedding.grid_
-            view.draft = Draft(view.scene, grid, DRAFT_SIZE, tree=tree, seed=self.seed)
+            view.draft = size, Draft(view.scene, grid, size, tree=tree, seed=self.seed)
         tables = {m: m.values(self.embedding) for m in materials}
-        image, error = view.draft.render(
+        image, error = view.draft[1].render(
             [tables[m] for m in materials], [m.mirror for m in materials]
         )
         view.times["draft"] = time.perf_counter() - start
-        return materials, image, error
+        return _Drafted(size, materials, image, error)
 
     def render(self, wait: bool = True, exact: bool = True) -> Float32:
         """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.

@@ -170,6 +170,8 @@ function make(tag, properties = {}, ...children) {
     else element.setAttribute(key, value);
   }
   element.append(...children);
+  // JupyterLab would take keys for its own, and asks what has the focus before what is around it
+  if (element.tabIndex >= 0) element.setAttribute("data-lm-suppress-shortcuts", "true");
   return element;
 }
 
@@ -257,7 +259,7 @@ class Canvas {
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
       this.sliders, this.status, this.said, this.history);
-    this.root = make("div", { className: "tb", tabIndex: 0, "data-lm-suppress-shortcuts": "true" },
+    this.root = make("div", { className: "tb", tabIndex: 0 },
       make("style", { textContent: STYLE }), this.stage, side);
     el.append(this.root);
     this.root.studio = this;
@@ -388,7 +390,8 @@ class Canvas {
   }
 
   moveRing(event) {
-    const box = this.box = this.picture.getBoundingClientRect();
+    // while the pen is down nothing moves the picture: asking where it is lays the page out
+    const box = this.held ? this.box : this.picture.getBoundingClientRect();
     const radius = (this.radius.input.value * box.width) / this.picture.width;
     const [x, y] = [event.clientX - box.left - radius, event.clientY - box.top - radius];
     if (this.ringed !== radius) {
@@ -440,7 +443,7 @@ class Canvas {
   slide(trait, slider) {
     const value = Number(slider.input.value);
     if (!this.sliding) {
-      this.sliding = { trait, part: this.state.part, start: this.state.scores[trait] };
+      this.sliding = { trait, part: this.state.part, start: slider.shown };
     }
     return { part: this.sliding.part, amounts: { [trait]: value - this.sliding.start } };
   }
@@ -481,14 +484,15 @@ class Canvas {
 
   async draw(header, buffer, times) {
     const { format, x, y, w, h } = header;
+    const bytes = buffer && new Uint8Array(buffer.buffer ?? buffer, buffer.byteOffset ?? 0,
+      header.bytes);
     if (this.picture.width !== header.width || this.picture.height !== header.height) {
       Object.assign(this.picture, { width: header.width, height: header.height });
     }
     if (format === "rgb") {
-      const bytes = new Uint8Array(buffer.buffer ?? buffer, buffer.byteOffset ?? 0, 3 * w * h);
       this.paper.putImageData(new ImageData(opaque(bytes), w, h), x, y);
     } else if (format !== "none") {
-      const bitmap = await decoded(buffer, `image/${format}`);
+      const bitmap = await decoded(bytes, `image/${format}`);
       this.paper.drawImage(bitmap, x, y);
       bitmap.close();
     }
@@ -498,7 +502,7 @@ class Canvas {
     if (this.drawn.length > 240) this.drawn.shift();
     if (times) {
       this.last = { ...times, drawn: times.newest === null ? null : now - times.newest };
-      this.times.push({ now, format, ms: header.ms, bytes: buffer?.byteLength ?? 0, ...this.last });
+      this.times.push({ now, format, ms: header.ms, bytes: header.bytes, ...this.last });
       if (this.times.length > 5000) this.times.shift();
     }
     if (header.parts) {
@@ -528,6 +532,7 @@ class Canvas {
       slider.input.addEventListener("change", () => {
         this.change({ slide: { ...this.slide(trait, slider), done: true } }, true);
         this.sliding = null;
+        slider.shown = Number(slider.input.value); // keys come faster than replies
       });
       return [trait, slider];
     }));
@@ -551,12 +556,13 @@ class Canvas {
     const { state } = this;
     this.parts.value = state.part;
     this.library.value = state.material;
-    for (const [trait, { input, output }] of Object.entries(this.scores ?? {})) {
+    for (const [trait, slider] of Object.entries(this.scores ?? {})) {
       if (this.sliding?.trait === trait) continue;
-      const score = state.scores[trait].toFixed(2);
-      if (output.textContent === score) continue;
-      input.value = state.scores[trait];
-      output.textContent = score;
+      slider.shown = state.scores[trait];
+      const score = slider.shown.toFixed(2);
+      if (slider.output.textContent === score) continue;
+      slider.input.value = slider.shown;
+      slider.output.textContent = score;
     }
     this.undo.disabled = !state.undo;
     this.redo.disabled = !state.redo;

@@ -19,24 +19,25 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
     - ``assign`` {part, material}
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
-      ``dragging`` says that more will follow at once: nothing is prepared until it does not
+      ``dragging`` says that more will follow at once: drafts are smaller, and nothing is prepared
+      until it does not
     - ``do``: "undo", "redo"
     - ``save``, ``open``: names of design files in the session's folder
     - ``before``: show what was there before the first edit
     - ``exact``: render without the basis what it cannot promise, which takes seconds
     - ``rest``: the hand rests: a whole frame without loss
-    - ``pad``: follow the reply by a message of 66,000 bytes, which carries it through a slow socket
+    - ``pad``: make the reply's buffer 66,000 bytes at least, by zeros at its end: between machines
+      of a notebook, the end of what is smaller waits for 40 ms
 
 Down (session to page)
 
 ``{"kind": "frame", "view", "seq", "format", "x", "y", "w", "h", "width", "height", "ms", "state",
-...}`` with the pixels that changed
+"bytes", ...}`` with the pixels that changed: the first ``bytes`` of the buffer
     ``format`` is "jpeg", "png", "rgb" (3 bytes a pixel) or "none" (nothing changed). ``ms`` are
     milliseconds spent on "edit", "render" and "encode". ``state`` says what is chosen and possible:
     see `Session._state`. The reply to a hello also has ``parts``, ``traits`` and ``library``.
 ``{"kind": "error", "view", "seq", "message"}``
     The request was not obeyed, or only in part. The session goes on.
-``{"kind": "pad", "view"}`` with 66,000 bytes that mean nothing
 ``{"kind": "changed", "by", "ready", "fraction"}``
     Pushed to whoever subscribes: another view (``by``) or the preparation changed the picture; ask
     for it by an empty input when it suits.
@@ -79,7 +80,9 @@ _SPACING = 0.03
 half a pixel as well."""
 _POINTS = 4096
 """Points of one stroke; what comes beyond is left out."""
-_PAD = bytes(66_000)
+_TURNING = 64
+"""Pixels along the longer side of drafts while the camera or the light is dragged."""
+_PADDED = 66_000
 _CHANGES = {"part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn", "do", "open"}
 """Keys of requests after which other views may be out of date."""
 
@@ -110,7 +113,8 @@ class Session:
         self._stroke: Stroke | None = None
         self._strength = (0.0, 0.0, 0)  # pixels travelled, sum of pressures, samples
         self._sliding = False
-        self._mine: object = None  # the edit that the stroke or slider at work replaces
+        self._hand: str | None = None  # the view whose stroke or slider is at work
+        self._mine: object = None  # the edit that it replaces
         self._only: str | None = None  # the part that the stroke at work stays on
         self._dragging = False
         self._part = edit.scene.parts[0]
@@ -184,7 +188,9 @@ class Session:
         ready = edit.ready
         draft_error = None
         if not ready:
-            image, draft_error = edit.draft()
+            # a hand that turns the object wants to see it turn
+            dragging = header.get("dragging") is True
+            image, draft_error = edit.draft(_TURNING if dragging else None)
         elif header.get("before") is True:
             image = edit.before()
         else:
@@ -195,7 +201,12 @@ class Session:
         whole = kind == "hello" or header.get("rest") is True
         reply, pixels = self._encoded(view, image, whole, header.get("rest") is True)
         done = time.perf_counter()
-        reply |= {"kind": "frame", "view": view, "seq": seq, "state": self._state(draft_error)}
+        reply |= {
+            "kind": "frame",
+            "view": view,
+            "seq": seq,
+            "state": self._state(view, draft_error),
+        }
         reply["ms"] = {
             "edit": round(1e3 * (edited - start), 2),
             "render": round(1e3 * (rendered - edited), 2),
@@ -210,13 +221,14 @@ class Session:
             self._refine()
         if _CHANGES.intersection(header):
             self._tell(view)
+        reply["bytes"] = len(pixels)
+        if header.get("pad") is True:
+            pixels += bytes(max(0, _PADDED - len(pixels)))
         replies: list[Reply] = [(reply, [pixels] if pixels else [])]
         if trouble:
             replies.insert(
                 0, ({"kind": "error", "view": view, "seq": None, "message": trouble}, [])
             )
-        if header.get("pad") is True:
-            replies.append(({"kind": "pad", "view": view}, [_PAD]))
         return replies
 
     def _act(self, view: str, header: Mapping[str, Any], buffers: Sequence[Any]) -> str:
@@ -225,8 +237,8 @@ class Session:
         for key, act in (
             ("part", self._choose),
             ("pick", self._pick),
-            ("brush", lambda brush: self._paint(brush, buffers)),
-            ("slide", self._slide),
+            ("brush", lambda brush: self._paint(view, brush, buffers)),
+            ("slide", lambda slide: self._slide(view, slide)),
             ("assign", self._assign),
             ("orbit", lambda _: self._look(header)),
             ("zoom", lambda _: None if "orbit" in header else self._look(header)),
@@ -258,7 +270,7 @@ class Session:
             if found >= 0:
                 self._part = scene.parts[found]
 
-    def _paint(self, brush: object, buffers: Sequence[Any]) -> None:
+    def _paint(self, view: str, brush: object, buffers: Sequence[Any]) -> None:
         if not isinstance(brush, Mapping):
             raise TypeError(f"expected an object, got {brush!r}")
         raw = bytes(buffers[0]) if buffers else b""
@@ -274,12 +286,12 @@ class Session:
                 continue
             if run[0, 3] == 0.0:
                 self._give_up()
-                self._strength = (0.0, 0.0, 0)
-            elif self._stroke is None:
+                self._strength, self._hand = (0.0, 0.0, 0), view
+            elif self._hand != view or self._sliding:
                 continue  # of a stroke that was given up
             self._continue(run, brush.get("trait"), amount, radius, brush.get("stay") is True)
             if (run[:, 3] == 2.0).any():
-                self._stroke = None
+                self._give_up()
 
     def _continue(
         self, run: NDArray[np.float64], trait: Any, amount: float, radius: float, stay: bool
@@ -329,18 +341,18 @@ class Session:
             self.edit.undo()
         self._mine = None
 
-    def _slide(self, slide: object) -> None:
+    def _slide(self, view: str, slide: object) -> None:
         if not isinstance(slide, Mapping) or not isinstance(slide.get("amounts"), Mapping):
             raise TypeError(f"expected an object with amounts, got {slide!r}")
         part, amounts = str(slide.get("part")), slide["amounts"]
         values = dict(zip(amounts, _numbers(list(amounts.values()), len(amounts)), strict=True))
-        if self._sliding:
+        if self._sliding and self._hand == view:
             self._take_back()
-        self._sliding = False
+        self._give_up()
         hold = () if set(amounts) & set(GROUPS["colour"]) else ("colour",)
         self.edit.move(part, hold, **values)
-        self._mine = self.edit.last
-        self._sliding = slide.get("done") is not True
+        if slide.get("done") is not True:
+            self._mine, self._hand, self._sliding = self.edit.last, view, True
 
     def _assign(self, assign: object) -> None:
         if not isinstance(assign, Mapping):
@@ -369,7 +381,8 @@ class Session:
 
     def _give_up(self) -> None:
         """A stroke or a slider does not outlive what it was begun on: what it did stays."""
-        self._stroke, self._sliding, self._mine, self._only = None, False, None, None
+        self._stroke, self._sliding, self._only = None, False, None
+        self._hand, self._mine = None, None
 
     def _do(self, what: object) -> None:
         self._give_up()
@@ -409,12 +422,12 @@ class Session:
 
     # -- replies --------------------------------------------------------------------------------
 
-    def _state(self, draft_error: float | None) -> Header:
+    def _state(self, view: str, draft_error: float | None) -> Header:
         """What is chosen and possible: for controls, and for what has to be in view always."""
         edit = self.edit
         ready = draft_error is None
         told: Header = {}
-        if self._stroke is None and not self._sliding:  # else it is told once it has ended
+        if self._hand != view:  # a hand at work is told once it rests
             known = edit.history
             told = {"edits": len(known), "history": [_shortened(line) for line in known[-6:]]}
         return {
