@@ -299,3 +299,13 @@ def test_jupyter_lab(page, tmp_path):
         page.reload()
         np.testing.assert_array_equal(driver.pixels(), shown)
         assert driver.state()["edits"] == 2
+        # a page of this machine has a socket; without it, the kernel's messages do
+        assert page.evaluate(f"{STUDIO}.channel === {STUDIO}.socket")
+        page.evaluate(f"{STUDIO}.socket.close()")
+        driver.until(f"{STUDIO}.channel === {STUDIO}.model")
+        driver.press("1")
+        driver.stroke(along(driver.scene, "lid"))
+        driver.edits(3)
+        driver.press("Control+z")
+        driver.edits(2)
+        np.testing.assert_array_equal(driver.pixels(), shown)

@@ -375,7 +375,11 @@ def test_two_views_of_one_session(session):
     for view, screen in (("a", first), ("b", second)):
         screen.draw(session.handle({"kind": "hello", "view": view}))
     first.draw(ask(session, [samples(along(session))], brush=BRUSH))
-    assert told[-1]["by"] == "a"
+    ask(session, do="redo")
+    deadline = time.monotonic() + 10.0
+    while not told and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert [news["by"] for news in told] == ["a"]  # what comes at once is told at once
     second.draw(ask(session, view="b"))
     first.draw(ask(session, rest=True))
     second.draw(ask(session, view="b", rest=True))
@@ -549,7 +553,7 @@ HOME = "http://127.0.0.1:80"
 
 @pytest.fixture
 def client(session):
-    with TestClient(application(session, "secret", lambda: {HOME}), base_url=HOME) as client:
+    with TestClient(application(session, "secret", {HOME}), base_url=HOME) as client:
         yield client
 
 
@@ -674,11 +678,40 @@ def test_the_widget_answers(session, monkeypatch):
     points = samples(along(session))
     message = {"kind": "input", "view": "a", "seq": 2, "brush": BRUSH}
     widget._handle_custom_msg(message, [memoryview(points)])
-    assert [header["kind"] for header in sent[-2:]] == ["changed", "frame"]
+    assert sent[-1]["kind"] == "frame"
+    assert "socket" not in sent[-1]
     assert len(session.edit.history) == 1
     widget._handle_custom_msg("what", [])
     assert sent[-1]["kind"] == "error"
+    deadline = time.monotonic() + 10.0
+    while sent[-1]["kind"] != "changed" and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert sent[-1]["by"] == "a"
     widget.close()
+
+
+def test_pages_of_this_machine_are_offered_a_socket(session, monkeypatch):
+    widget = studio(session.edit)
+    sent = []
+    monkeypatch.setattr(widget, "send", lambda header, buffers=None: sent.append(header))
+    for origin in ("https://hub.example", "http://127.0.0.1.example:8888", "", 3, "x" * 101, None):
+        widget._handle_custom_msg({"kind": "hello", "view": "a", "origin": origin}, [])
+        assert (sent[-1]["kind"], sent[-1]["socket"]) == ("frame", None)
+    assert widget._server is None
+    home = "http://localhost:8888"
+    widget._handle_custom_msg({"kind": "hello", "view": "a", "origin": home}, [])
+    address = sent[-1]["socket"]
+    assert address.startswith("ws://127.0.0.1:")
+    with pytest.raises(Exception, match="403"):
+        connect(address, origin="http://127.0.0.1:1")
+    with connect(address, origin=home, max_size=None) as socket:
+        socket.send(pack({"kind": "hello", "view": "a", "seq": 7}, []))
+        header, _ = unpack(socket.recv())
+        assert (header["kind"], header["seq"]) == ("frame", 7)
+        widget.close()
+        with pytest.raises(ConnectionClosed):
+            while True:
+                socket.recv(timeout=10.0)
 
 
 def test_the_widget_leaves_a_still_picture(session):

@@ -14,8 +14,9 @@ const sameKeys = (a, b) => JSON.stringify(Object.keys(a)) === JSON.stringify(Obj
 export class Link {
   constructor(view, send, {
     now = () => performance.now(), later = (act, ms) => setTimeout(act, ms), padding = true,
+    greeting = {},
   } = {}) {
-    Object.assign(this, { view, send, now, later, padding });
+    Object.assign(this, { view, send, now, later, padding, greeting });
     this.queue = []; // of requests that cannot be put together
     this.flying = null;
     this.seq = 0;
@@ -82,6 +83,7 @@ export class Link {
     const message = { kind, view: this.view, seq, ...header };
     delete message.hello;
     if (this.pad) message.pad = true;
+    if (kind === "hello") Object.assign(message, this.greeting);
     this.later(() => {
       if (this.flying?.seq === seq) this.renew();
     }, LOST);
@@ -107,6 +109,63 @@ export class Link {
     this.queue = this.queue.filter(({ header }) => !("hello" in header));
     this.queue.unshift({ header: { hello: true }, samples: [], newest: null });
     this.pump();
+  }
+}
+
+const encoder = new TextEncoder();
+const decoder = new TextDecoder();
+
+/** What a notebook's widget manager does for the canvas, over one WebSocket (see page.py). */
+export class Socket {
+  constructor(address, lasting) {
+    Object.assign(this, { address, lasting });
+    this.listeners = new Set();
+    this.open();
+  }
+
+  open() {
+    this.socket = new WebSocket(this.address);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onmessage = ({ data }) => {
+      const length = new DataView(data).getUint32(0, true);
+      const header = JSON.parse(decoder.decode(new Uint8Array(data, 4, length)));
+      const rest = data.byteLength - 4 - length;
+      this.tell(header, rest ? [new DataView(data, 4 + length, rest)] : []);
+    };
+    this.socket.onopen = () => this.tell({ kind: "open" }, []);
+    this.socket.onclose = ({ code }) => {
+      this.tell({ kind: "closed", refused: code === 4403 || code === 1006 && !this.greeted }, []);
+      if (this.greeted && this.lasting) setTimeout(() => this.open(), 1000);
+    };
+  }
+
+  tell(header, buffers) {
+    if (header.kind === "frame") this.greeted = true;
+    for (const listener of this.listeners) listener(header, buffers);
+  }
+
+  on(name, listener) {
+    if (name === "msg:custom") this.listeners.add(listener);
+  }
+
+  off(name, listener) {
+    this.listeners.delete(listener);
+  }
+
+  send(header, callbacks, buffers = []) {
+    if (this.socket.readyState !== WebSocket.OPEN) return;
+    const head = encoder.encode(JSON.stringify(header));
+    const body = buffers.length ? new Uint8Array(buffers[0]) : new Uint8Array(0);
+    const message = new Uint8Array(4 + head.length + body.length);
+    new DataView(message.buffer).setUint32(0, head.length, true);
+    message.set(head, 4);
+    message.set(body, 4 + head.length);
+    this.socket.send(message);
+  }
+
+  close() {
+    this.lasting = false;
+    this.socket.close();
   }
 }
 
@@ -186,9 +245,14 @@ class Canvas {
   constructor(model, el, fill) {
     this.model = model;
     this.view = Math.random().toString(36).slice(2);
-    // our own server does not hold small messages back
-    this.link = new Link(this.view, (header, buffers) => model.send(header, undefined, buffers),
-      { padding: !fill });
+    this.channel = model;
+    const local = ["127.0.0.1", "localhost"].includes(location.hostname);
+    this.link = new Link(this.view, (header, buffers) => {
+      this.channel.send(header, undefined, buffers);
+    }, {
+      padding: !fill, // our own server does not hold small messages back
+      greeting: fill || !local ? {} : { origin: location.origin },
+    });
     this.tool = "brush";
     this.state = null;
     this.drawn = [];
@@ -206,6 +270,7 @@ class Canvas {
     clearTimeout(this.resting);
     clearTimeout(this.telling);
     this.model.off("msg:custom", this.listener);
+    this.socket?.close();
     for (const undo of this.undoing) undo();
   }
 
@@ -461,11 +526,29 @@ class Canvas {
       this.said.textContent = header.message;
       if (header.seq !== null) this.link.answered(header);
     } else if (header.kind === "frame") {
+      if (header.socket && !this.socket) this.connect(header.socket);
       const times = this.link.answered(header); // the next request leaves before this is drawn
       this.drawing = this.drawing.then(() => this.draw(header, buffers[0], times)).catch((error) => {
         this.said.textContent = `${error}`;
       });
     }
+  }
+
+  /** A socket that needs no kernel in between: what it cannot do, the kernel's messages do. */
+  connect(address) {
+    this.socket = new Socket(address, false);
+    this.socket.on("msg:custom", (header, buffers) => {
+      if (header.kind === "open") {
+        this.channel = this.socket;
+        Object.assign(this.link, { padding: false, pad: false });
+        this.link.renew();
+      } else if (header.kind === "closed") {
+        if (this.channel !== this.socket) return;
+        this.channel = this.model;
+        this.link.padding = true;
+        this.link.renew();
+      } else this.hear(header, buffers);
+    });
   }
 
   others({ by, fraction, ready }) {

@@ -14,7 +14,7 @@ import json
 import secrets
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Set
 from pathlib import Path
 
 import uvicorn
@@ -65,7 +65,7 @@ def unpack(message: bytes) -> tuple[object, list[bytes]]:
     return header, [rest] if rest else []
 
 
-def application(session: Session, token: str, origins: Callable[[], set[str]]) -> Starlette:
+def application(session: Session, token: str, origins: Set[str]) -> Starlette:
     """The page, its modules and its socket.
 
     Parameters
@@ -93,7 +93,7 @@ def application(session: Session, token: str, origins: Callable[[], set[str]]) -
 
     async def channel(websocket: WebSocket) -> None:
         if not known(websocket.query_params.get("token")) or (
-            websocket.headers.get("origin") not in origins()
+            websocket.headers.get("origin") not in origins
         ):
             await websocket.close(4403)
             return
@@ -163,6 +163,8 @@ class Server:
     Attributes
     ----------
     url : the page's address, token included
+    socket_url : that of its socket
+    origins : pages that may open it; others may be added
     """
 
     def __init__(self, session: Session, port: int = 0) -> None:
@@ -180,10 +182,11 @@ class Server:
             raise
         self.port = int(self._socket.getsockname()[1])
         self.url = f"http://127.0.0.1:{self.port}/?token={self.token}"
-        hosts = {f"http://{host}:{self.port}" for host in ("127.0.0.1", "localhost")}
+        self.socket_url = f"ws://127.0.0.1:{self.port}/socket?token={self.token}"
+        self.origins = {f"http://{host}:{self.port}" for host in ("127.0.0.1", "localhost")}
         self._server = uvicorn.Server(
             uvicorn.Config(
-                application(session, self.token, lambda: hosts),
+                application(session, self.token, self.origins),
                 log_level="error",
                 access_log=False,
                 ws="websockets-sansio",

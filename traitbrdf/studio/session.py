@@ -6,8 +6,9 @@ queue can grow, and both sides lag by one frame at most.
 
 Up (page to session). All keys but ``kind`` and ``view`` may be missing.
 
-``{"kind": "hello", "view"}``
-    Asks for everything: names, sizes, a whole frame.
+``{"kind": "hello", "view", "origin"}``
+    Asks for everything: names, sizes, a whole frame. ``origin`` is the page's, if it would rather
+    have a socket: transports that can offer one add its address to the reply, as ``socket``.
 ``{"kind": "input", "view", "seq", ...}`` with samples (n, 4) float32: x, y, pressure, phase
     ``seq`` is any number; the reply repeats it. Samples are in pixels of the image; pressure is 0
     to 1; phase 0 is the pen put down, 1 moved, 2 lifted. Further keys, in the order in which they
@@ -26,8 +27,8 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``before``: show what was there before the first edit
     - ``exact``: render without the basis what it cannot promise, which takes seconds
     - ``rest``: the hand rests: a whole frame without loss
-    - ``pad``: make the reply's buffer 66,000 bytes at least, by zeros at its end: between machines
-      of a notebook, the end of what is smaller waits for 40 ms
+    - ``pad``: make the reply's buffer 66,000 bytes at least, by zeros at its end: sockets of
+      notebook servers keep the end of what is smaller for 40 ms
 
 Down (session to page)
 
@@ -39,8 +40,8 @@ Down (session to page)
 ``{"kind": "error", "view", "seq", "message"}``
     The request was not obeyed, or only in part. The session goes on.
 ``{"kind": "changed", "by", "ready", "fraction"}``
-    Pushed to whoever subscribes: another view (``by``) or the preparation changed the picture; ask
-    for it by an empty input when it suits.
+    Pushed to whoever subscribes, ten times a second at most: a view (``by``; "" is several) or the
+    preparation changed the picture; other views ask for it by an empty input when it suits.
 """
 
 from __future__ import annotations
@@ -80,6 +81,8 @@ _SPACING = 0.03
 half a pixel as well."""
 _POINTS = 4096
 """Points of one stroke; what comes beyond is left out."""
+_NEWS = 0.1
+"""Seconds in which changes are put together before views are told of them."""
 _TURNING = 64
 """Pixels along the longer side of drafts while the camera or the light is dragged."""
 _PADDED = 66_000
@@ -120,6 +123,8 @@ class Session:
         self._part = edit.scene.parts[0]
         self._light: object = None
         self._display = Display(1.0)
+        self._telling: threading.Timer | None = None
+        self._teller = ""  # the view that changed what will be told
         self._refiner: threading.Thread | None = None
         self._closed = False
         self._fraction = 0.0
@@ -161,6 +166,8 @@ class Session:
         with self._lock:
             self._closed = True
             self._pushes.clear()
+            if self._telling is not None:
+                self._telling.cancel()
         self.edit.cancel()
         if self._refiner is not None:
             self._refiner.join(10.0)
@@ -480,11 +487,25 @@ class Session:
     # -- what happens unasked -------------------------------------------------------------------
 
     def _tell(self, by: str) -> None:
-        news = {
-            "kind": "changed", "by": by, "ready": self.edit.ready,
-            "fraction": round(self._fraction, 3),
-        }  # fmt: skip
-        for push in list(self._pushes.values()):
+        """Tell soon; what changes until then is told with it."""
+        with self._lock:
+            if self._telling is not None:
+                self._teller = by if by == self._teller else ""
+            elif not self._closed:
+                self._teller = by
+                self._telling = threading.Timer(_NEWS, self._say)
+                self._telling.daemon = True
+                self._telling.start()
+
+    def _say(self) -> None:
+        with self._lock:
+            self._telling = None
+            news = {
+                "kind": "changed", "by": self._teller, "ready": self.edit.ready,
+                "fraction": round(self._fraction, 3),
+            }  # fmt: skip
+            pushes = list(self._pushes.values())
+        for push in pushes:
             try:
                 push(dict(news), [])
             except Exception:  # a view that is gone: its transport ends the subscription

@@ -1,13 +1,21 @@
-"""The live canvas in a notebook: `canvas.js` over the kernel's messages."""
+"""The live canvas in a notebook: `canvas.js` over the kernel's messages.
+
+A message of a kernel passes a server and wakes all that watches the kernel, which takes longer than
+a frame. So where browser and kernel are on one machine, the page is offered a socket of its own;
+where it cannot be opened, messages go on.
+"""
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import anywidget
 
 from traitbrdf.editing import EditSession
+from traitbrdf.studio.page import Server
 from traitbrdf.studio.session import Session
 
 
@@ -24,13 +32,31 @@ class Canvas(anywidget.AnyWidget):
     def __init__(self, edit: EditSession, **settings: Any) -> None:
         super().__init__(**settings)
         self.session = Session(edit)
+        self._server: Server | None = None
         self.on_msg(self._answer)
         self.session.subscribe(lambda header, buffers: self.send(header, buffers))
 
     def _answer(self, widget: object, content: object, buffers: list[Any]) -> None:
         # kernels deliver messages in a thread of their own: the session has a lock
         for header, binary in self.session.handle(content, buffers or ()):
+            if isinstance(content, dict) and header["kind"] == "frame" and "origin" in content:
+                header["socket"] = self._socket(content["origin"])
             self.send(header, binary)
+
+    def _socket(self, origin: object) -> str | None:
+        """The address of a socket for a page that came from this machine, or seems to."""
+        if not isinstance(origin, str) or len(origin) > 100:
+            return None
+        if urlsplit(origin).hostname not in ("127.0.0.1", "localhost"):
+            return None
+        if self._server is None:
+            try:
+                self._server = Server(self.session)
+            except OSError:  # a machine without sockets
+                return None
+            threading.Thread(target=self._server.run, name="traitbrdf-page", daemon=True).start()
+        self._server.origins.add(origin)
+        return self._server.socket_url
 
     def _repr_mimebundle_(self, **settings: Any) -> Any:
         """The widget, and a still picture for pages that have no kernel."""
@@ -43,5 +69,7 @@ class Canvas(anywidget.AnyWidget):
         return {**still, **bundle}
 
     def close(self) -> None:
+        if self._server is not None:
+            self._server.stop()
         self.session.close()
         super().close()
