@@ -134,7 +134,7 @@ import traitbrdf as tb
 sys.path.insert(0, {folder!r})
 from live import scene
 edit = tb.EditSession(scene())
-edit.assign(list(edit.scene.shape.parts), "blue-plastic")
+edit.assign(list(edit.scene.shape.parts), "red-rubber")
 edit.prepare()
 tb.studio(edit)"""
 
@@ -142,7 +142,7 @@ tb.studio(edit)"""
 def serve() -> None:
     """The page of a session like that of the notebook; says its address."""
     edit = tb.EditSession(scene())
-    edit.assign(list(edit.scene.shape.parts), "blue-plastic")
+    edit.assign(list(edit.scene.shape.parts), "red-rubber")
     edit.prepare()
     server = Server(Session(edit))
     thread = threading.Thread(target=server.run)
@@ -165,44 +165,55 @@ def page() -> Iterator[str]:
         server.stdin.close()
 
 
+class Hand:
+    """A mouse on the canvas, to and fro along a path."""
+
+    def __init__(self, tab: Tab, path: np.ndarray) -> None:
+        self.tab, self.path = tab, path
+        self.left, self.top, self.scale = tab.evaluate(
+            "(() => { const c = document.querySelector('.tb canvas');"
+            " const b = c.getBoundingClientRect(); return [b.left, b.top, b.width / c.width]; })()"
+        )
+
+    def press(self, index: int) -> None:
+        self._dispatch(index, type="mousePressed", clickCount=1)
+
+    def move(self, index: int) -> None:
+        self._dispatch(index, type="mouseMoved", buttons=1)
+
+    def lift(self, index: int) -> None:
+        self._dispatch(index, type="mouseReleased", clickCount=1)
+
+    def _dispatch(self, index: int, **event: Any) -> None:
+        at = index % (2 * len(self.path) - 2)
+        x, y = self.path[at if at < len(self.path) else 2 * len(self.path) - 2 - at]
+        place = {"x": self.left + x * self.scale, "y": self.top + y * self.scale}
+        self.tab.tell("Input.dispatchMouseEvent", button="left", **event, **place)
+
+
 def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
     """Strokes to and fro along a path for some seconds; what the canvas measured meanwhile."""
     tab.until(f"{STUDIO}?.state?.ready")
     tab.evaluate(f"{STUDIO}.root.scrollIntoView()")
     time.sleep(1.0)
-    box = tab.evaluate(
-        "(() => { const b = document.querySelector('.tb canvas').getBoundingClientRect();"
-        " return [b.left, b.top, b.width / document.querySelector('.tb canvas').width]; })()"
-    )
     tab.evaluate(f"{STUDIO}.times.splice(0), Object.assign({STUDIO}.radius.input, {{value: 60}})")
-
-    def place(index: int) -> dict[str, float]:
-        # to the path's end and back, again and again
-        at = index % (2 * len(path) - 2)
-        x, y = path[at if at < len(path) else 2 * len(path) - 2 - at]
-        return {"x": box[0] + x * box[2], "y": box[1] + y * box[2]}
-
+    hand = Hand(tab, path)
     start = time.perf_counter()
     index, held = 0, False
     while (now := time.perf_counter() - start) < SECONDS:
-        fresh = index % 32 == 0  # a new stroke about every quarter of a second
-        if fresh and held:
-            tab.tell("Input.dispatchMouseEvent", type="mouseReleased", button="left",
-                     clickCount=1, **place(index))  # fmt: skip
-        if fresh:
+        if index % 32 == 0:  # a new stroke about every quarter of a second
+            if held:
+                hand.lift(index)
             sign = 1 if (index // 32) % 2 else -1
             amount = f"Object.assign({STUDIO}.amount.input, {{value: {0.6 * sign}}})"
             tab.tell("Runtime.evaluate", expression=amount)
-            tab.tell("Input.dispatchMouseEvent", type="mousePressed", button="left",
-                     clickCount=1, **place(index))  # fmt: skip
+            hand.press(index)
             held = True
         else:
-            tab.tell("Input.dispatchMouseEvent", type="mouseMoved", button="left", buttons=1,
-                     **place(index))  # fmt: skip
+            hand.move(index)
         index += 1
         time.sleep(max(0.0, index / RATE - now))
-    tab.ask("Input.dispatchMouseEvent", type="mouseReleased", button="left", clickCount=1,
-            **place(index))  # fmt: skip
+    hand.lift(index)
     times = tab.evaluate(
         f"{STUDIO}.times.filter(t => t.drawn !== null).map(t => [t.now, t.drawn, t.trip, t.work,"
         " t.format === 'none' ? 0 : 1, t.bytes])"
@@ -219,6 +230,27 @@ def paint(tab: Tab, path: np.ndarray) -> dict[str, float]:
         "error": float(tab.evaluate(f"{STUDIO}.state.error")),
         "padded": bool(tab.evaluate(f"{STUDIO}.link.pad")),
     }
+
+
+def show(tab: Tab, path: np.ndarray, picture: Path) -> None:
+    """A picture of one stroke alone: what was painted for the clock's sake is undone."""
+    idle = f"!{STUDIO}.link.flying && !{STUDIO}.link.queue.length"
+    tab.until(idle)
+    for _ in range(int(tab.evaluate(f"{STUDIO}.state.edits")) - 1):
+        tab.evaluate(f"{STUDIO}.change({{do: 'undo'}}, false)")
+    tab.until(f"{STUDIO}.state.edits === 1 && {idle}")
+    for name, value in (("amount", 0.6), ("radius", 60)):
+        moved = f"Object.assign({STUDIO}.{name}.input, {{value: {value}}})"
+        tab.evaluate(f"{moved}.dispatchEvent(new Event('input'))")
+    hand = Hand(tab, path)
+    hand.press(0)
+    for index in range(1, len(path)):
+        hand.move(index)
+        time.sleep(1.0 / RATE)
+    hand.lift(len(path) - 1)
+    tab.until(f"{STUDIO}.lossless && {STUDIO}.state.edits === 2")
+    time.sleep(1.0)
+    tab.screenshot(picture)
 
 
 def tell(name: str, found: dict[str, float], fps: float, drawn: float) -> None:
@@ -257,14 +289,15 @@ def main() -> int:
     with chromium() as port:
         with page() as address, Tab(port, address) as tab:
             tell("page", paint(tab, path), 60.0, 25.0)
-            time.sleep(1.0)
-            tab.screenshot(given.out / "page.png")
+            show(tab, path, given.out / "page.png")
             tab.tell("Page.close")
+        data = default_data()
+        shared = {} if data is None else {"TRAITBRDF_SHARED": str(data.resolve())}
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             cell = CELL.format(folder=str(Path(__file__).parent))
             write_notebook(Path(folder) / "live.ipynb", cell)
             with (
-                jupyter_lab(Path(folder)) as address,
+                jupyter_lab(Path(folder), **shared) as address,
                 Tab(port, f"{address}/lab/tree/live.ipynb") as tab,
             ):
                 tab.until(KERNEL_IDLE)
@@ -274,8 +307,7 @@ def main() -> int:
                 tab.evaluate(f"{STUDIO}.socket.close()")
                 tab.until(f"{STUDIO}.channel === {STUDIO}.model")
                 tell("its kernel", paint(tab, path), 30.0, 50.0)
-                time.sleep(1.0)
-                tab.screenshot(given.out / "lab.png")
+                show(tab, path, given.out / "lab.png")
     print(f"screenshots: {given.out}/page.png and {given.out}/lab.png")
     return 0
 
