@@ -13,21 +13,29 @@ from hypothesis import strategies as st
 
 from traitbrdf.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
 from traitbrdf.models import (
+    ABC,
     GGX,
+    GTR,
     AshikhminShirley,
+    Beckmann,
+    BlinnPhong,
     BoundedPhong,
     BoundedTorranceSparrow,
     Coated,
+    Interference,
     Lambert,
     Model,
     NormalizedPhong,
     OrenNayar,
     PerfectMirror,
     Plastic,
+    RetroReflection,
     Scaled,
     Sheen,
+    ShiftedGamma,
     Sum,
     TorranceSparrowSimplified,
+    Ward,
     fresnel_conductor,
     fresnel_dielectric,
     ggx_distribution,
@@ -46,6 +54,14 @@ MODELS: tuple[type[Model], ...] = (
     GGX,
     Sheen,
     Plastic,
+    BlinnPhong,
+    Beckmann,
+    GTR,
+    ABC,
+    ShiftedGamma,
+    Ward,
+    RetroReflection,
+    Interference,
 )
 RECIPROCAL = [cls for cls in MODELS if cls.reciprocal]
 BOUNDED = [cls for cls in MODELS if cls.energy_bounded]
@@ -294,6 +310,75 @@ def test_ggx_white_furnace():
         assert albedo(GGX(0.002, 0.05, 12.0), degrees).min() > 0.99
     # single scattering only, as documented
     assert albedo(GGX(1.0, 0.05, 12.0), 0.0)[0] == pytest.approx(0.31, abs=0.01)
+
+
+LOBES = (BlinnPhong, Beckmann, GTR, ABC, ShiftedGamma)
+
+
+@settings(max_examples=60, deadline=None)
+@given(models(LOBES))
+def test_densities_of_half_vectors_integrate_to_one(lobe):
+    """By another rule than the one that norms them."""
+    theta = np.concatenate([[0.0], np.geomspace(1e-7, 0.5 * math.pi, 40_001)])
+    density = lobe._shape(np.sin(theta) ** 2) / lobe._norm
+    # the steps of a solid angle are exact; the density is taken at both ends of each
+    steps = 2.0 * math.pi * -np.diff(np.cos(theta))
+    steps[theta[1:] < 1e-3] = math.pi * np.diff(theta**2)[theta[1:] < 1e-3]
+    assert (0.5 * (density[1:] + density[:-1])) @ steps == pytest.approx(1.0, rel=2e-4)
+
+
+def test_lobes_of_known_norms_and_limits():
+    n = 40.0
+    wi, wo = direction(50.0), direction(20.0, 2.0)
+    half = (wi + wo) / np.linalg.norm(wi + wo)
+    frame = 4.0 * (half @ wi) * max(wi[2], wo[2])
+    fresnel = 0.2 + 0.8 * (1.0 - half @ wi) ** 5
+    expected = 0.5 * fresnel * (n + 1.0) / (2.0 * math.pi) * half[2] ** n / frame
+    assert BlinnPhong(0.5, 0.2, n).eval(wi, wo)[0] == pytest.approx(expected, rel=1e-6)
+    same = AshikhminShirley(r_d=0.0, r_s=0.2, n_u=n, n_v=n)
+    assert 0.5 * same.eval(wi, wo)[0] == pytest.approx(expected, rel=1e-6)
+    # narrow lobes are densities of facets: D cos(theta_h) = P
+    alpha = 0.02
+    wi, wo = direction(31.0), direction(30.0, math.pi)
+    half = (wi + wo) / np.linalg.norm(wi + wo)
+    frame = 4.0 * (half @ wi) * max(wi[2], wo[2])
+    ggx = ggx_distribution(half, alpha) / frame
+    assert GTR(1.0, 1.0, alpha, 2.0).eval(wi, wo)[0] == pytest.approx(ggx, rel=2e-3)
+    beckmann = Beckmann(1.0, 1.0, alpha).eval(wi, wo)[0]
+    assert Ward(1.0, alpha).eval(wi, wo)[0] == pytest.approx(beckmann, rel=0.02)
+    assert ShiftedGamma(1.0, 1.0, 0.04, 0.0).eval(wi, wo)[0] == pytest.approx(
+        Beckmann(1.0, 1.0, 0.2).eval(wi, wo)[0], rel=1e-9
+    )
+
+
+def test_tails_are_as_heavy_as_their_parameter_says():
+    def fall(lobe):
+        peak = lobe.eval(direction(30.0), direction(30.0, math.pi))[0]
+        return lobe.eval(direction(10.0), direction(50.0, math.pi))[0] / peak
+
+    falls = [fall(GTR(0.5, 1.0, 0.05, gamma)) for gamma in (1.0, 1.5, 2.0, 4.0)]
+    assert sorted(falls, reverse=True) == falls
+    assert falls[0] > 40.0 * falls[2] > 0.0
+    assert fall(ABC(0.5, 1.0, 800.0, 0.7)) > 30.0 * fall(Beckmann(0.5, 1.0, 0.05))
+
+
+def test_fringes_turn_with_the_angle():
+    film = Interference(0.8, 0.3, 400.0, 1.6, 1.0)
+    for degrees in (0.0, 30.0, 60.0):
+        wi, wo = direction(degrees), direction(degrees, math.pi)
+        inside = math.sqrt(1.0 - (math.sin(math.radians(degrees)) / 1.6) ** 2)
+        phase = 4.0 * math.pi * 1.6 * 400.0 * inside / np.array([650.0, 550.0, 450.0])
+        plain = Interference(0.8, 0.3, 0.0, 1.6, 1.0).eval(wi, wo)
+        np.testing.assert_allclose(film.eval(wi, wo), plain * 0.5 * (1.0 + np.cos(phase)))
+
+
+def test_retro_reflection_goes_back():
+    model = RetroReflection(0.4, 200.0)
+    wi = direction(50.0)
+    peak = model.eval(wi, wi)[0]
+    assert peak == pytest.approx(0.4 * 201.0 / (2.0 * math.pi) / wi[2])
+    assert model.eval(wi, direction(50.0, math.pi))[0] < 1e-6 * peak
+    assert albedo(model, 0.0) == pytest.approx(0.4, rel=0.01)
 
 
 def test_fresnel_known_values():
