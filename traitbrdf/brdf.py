@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -29,6 +29,10 @@ from traitbrdf.directions import (
 )
 
 Float64 = NDArray[np.float64]
+
+
+_Bracket: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Float64]
+"""Lower nodes, upper nodes, and the share of the upper ones."""
 
 
 class Reflectance(Protocol):
@@ -163,21 +167,7 @@ class HalfDiffGrid:
             np.asarray(theta_d, np.float64),
             np.asarray(phi_d, np.float64),
         )
-        i0, i1, fi = self._bracket_theta_h(th)
-        j0, j1, fj = _bracket_uniform(
-            td * (self._last(self.n_theta_d) / (math.pi / 2)), self.n_theta_d
-        )
-        if self.layout == "merl":
-            x = np.mod(pd, math.pi) * (self.n_phi_d / math.pi)
-            base = np.floor(x)
-            l0 = base.astype(np.int64) % self.n_phi_d
-            l1 = (l0 + 1) % self.n_phi_d
-            fl = x - base
-        else:
-            l0, l1, fl = _bracket_uniform(
-                np.asarray(fold_phi_d(pd) * ((self.n_phi_d - 1) / (math.pi / 2)), np.float64),
-                self.n_phi_d,
-            )
+        (i0, i1, fi), (j0, j1, fj), (l0, l1, fl) = self._brackets(th, td, pd)
         index = np.empty((*th.shape, 8), np.int64)
         weight = np.empty((*th.shape, 8), np.float64)
         corner = 0
@@ -189,9 +179,22 @@ class HalfDiffGrid:
                     corner += 1
         return index, weight
 
-    def _bracket_theta_h(
-        self, theta_h: Float64
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
+    def _brackets(self, theta_h: Float64, theta_d: Float64, phi_d: Float64) -> list[_Bracket]:
+        """Along each axis the nodes on both sides, and how far from the lower one."""
+        scale = self._last(self.n_theta_d) / (math.pi / 2)
+        along = [
+            self._bracket_theta_h(theta_h),
+            _bracket_uniform(theta_d * scale, self.n_theta_d),
+        ]
+        if self.layout == "merl":
+            x = np.mod(phi_d, math.pi) * (self.n_phi_d / math.pi)
+            base = np.floor(x)
+            low = base.astype(np.int64) % self.n_phi_d
+            return [*along, (low, (low + 1) % self.n_phi_d, x - base)]
+        folded = fold_phi_d(phi_d) * ((self.n_phi_d - 1) / (math.pi / 2))
+        return [*along, _bracket_uniform(np.asarray(folded, np.float64), self.n_phi_d)]
+
+    def _bracket_theta_h(self, theta_h: Float64) -> _Bracket:
         nodes = self.theta_h
         x = np.sqrt(np.maximum(theta_h, 0.0) / (math.pi / 2)) * self._last(self.n_theta_h)
         low = np.clip(np.floor(x).astype(np.int64), 0, self.n_theta_h - 2)
@@ -199,9 +202,7 @@ class HalfDiffGrid:
         return low, low + 1, np.clip(fraction, 0.0, 1.0)
 
 
-def _bracket_uniform(
-    x: Float64, count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
+def _bracket_uniform(x: Float64, count: int) -> _Bracket:
     low = np.clip(np.floor(x).astype(np.int64), 0, count - 2)
     return low, low + 1, np.clip(x - low, 0.0, 1.0)
 
@@ -330,14 +331,21 @@ class TabulatedBRDF:
         """The same BRDF on another grid, log f interpolated (lobes span many decades)."""
         if grid == self.grid:
             return self
-        index, weight = self.grid.stencil(*grid.node_angles())
-        floor = 1e-12
-        logs = np.log(self.values.reshape(-1, 3).astype(np.float64) + floor)
-        values = np.zeros((*grid.shape, 3))
-        for corner in range(8):  # corner by corner: a MERL grid has 1.5 million nodes
-            values += weight[..., corner, None] * logs[index[..., corner]]
-        table = np.maximum(np.exp(values) - floor, 0.0).astype(self.values.dtype)
-        return TabulatedBRDF(grid, table, self._mirror, self.name)
+        floor = self.values.dtype.type(1e-12)
+        logs = np.log(self.values + floor)
+        nodes = self.grid._brackets(grid.theta_h, grid.theta_d, grid.phi_d)
+        for axis, (low, high, fraction) in enumerate(nodes):  # grids are products of their axes
+            shape = [-1 if a == axis else 1 for a in range(4)]
+            part = fraction.astype(logs.dtype).reshape(shape)
+            lower = logs.take(low, axis=axis)
+            logs = logs.take(high, axis=axis)
+            logs -= lower
+            logs *= part
+            logs += lower
+        np.exp(logs, out=logs)
+        logs -= floor
+        np.maximum(logs, 0.0, out=logs)
+        return TabulatedBRDF(grid, logs, self._mirror, self.name)
 
 
 def _mirror_weight(value: ArrayLike) -> Float64:
