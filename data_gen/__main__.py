@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 
 from data_gen.packing import COMPONENTS, COUNT, SEED, build
+from data_gen.tables import Tables
+from traitbrdf.embedding import GRID
 from traitbrdf.formats import write_arrays
 
 _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "library.npz"
@@ -19,8 +21,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=COUNT, help="materials (%(default)s)")
     parser.add_argument("--seed", type=int, default=SEED, help="seed (%(default)s)")
     parser.add_argument(
-        "--components", type=int, default=COMPONENTS, help="per colour channel (%(default)s)"
+        "--components",
+        type=int,
+        nargs=2,
+        default=COMPONENTS,
+        metavar=("GREY", "COLOUR"),
+        help="of the channels' mean, and of each of two colour axes (%(default)s)",
     )
+    parser.add_argument(
+        "--tables", type=Path, default=Path("out/tables"), metavar="DIR",
+        help="where tables are kept meanwhile, 0.24 MB a material; the same command goes on there "
+        "after an interruption (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--keep", action="store_true", help="do not delete them in the end")
+    parser.add_argument(
+        "--workers", type=lambda text: int(text) if text.isdigit() else text, default=0,
+        help="processes of a local Dask cluster that make them, or a scheduler's address whose "
+        "workers see the folder; 0: this process (%(default)s)",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
     start = time.perf_counter()
     tty = sys.stderr.isatty()
@@ -33,16 +51,25 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if not given.out.parent.is_dir():  # rather than after the work
             raise FileNotFoundError(f"{given.out}: expected an existing folder")
-        arrays = build(given.count, given.seed, given.components, progress)
+        arrays = build(
+            given.count, given.seed, tuple(given.components), progress, given.tables, given.workers
+        )
         write_arrays(given.out, arrays)
+        if not given.keep:
+            Tables(given.tables, given.count, given.seed, GRID).remove()
     except KeyboardInterrupt:
-        print("interrupted; nothing was written", file=sys.stderr)
+        print(
+            f"interrupted; {given.out} is as it was, and what was tabulated waits in "
+            f"{given.tables} for the same command",
+            file=sys.stderr,
+        )
         return 1
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"data_gen: {error}", file=sys.stderr)
         return 1
+    count, coordinates = arrays["coordinates"].shape
     print(
-        f"{given.out}: {len(arrays['names'])} materials, {3 * given.components} coordinates, "
+        f"{given.out}: {count} materials, {coordinates} coordinates, "
         f"{given.out.stat().st_size / 1e6:.2f} MB, {time.perf_counter() - start:.1f} s"
     )
     return 0

@@ -19,16 +19,25 @@ import numpy as np
 
 from traitbrdf.brdf import Reflectance
 from traitbrdf.models import (
+    ABC,
     GGX,
+    GTR,
     AshikhminShirley,
+    Beckmann,
+    BlinnPhong,
     BoundedPhong,
     BoundedTorranceSparrow,
     Coated,
+    Interference,
     Lambert,
     Model,
     OrenNayar,
     Plastic,
+    RetroReflection,
     Sheen,
+    ShiftedGamma,
+    Ward,
+    fresnel_conductor,
 )
 
 RGB: TypeAlias = tuple[float, float, float]
@@ -222,6 +231,47 @@ def greasy(colour: RGB, sigma: float, alpha: float, film_alpha: float, film: flo
 def dusty(base: Model, dust: RGB, cover: float) -> Model:
     """Dust that covers a fraction of another material and glows at the rim."""
     return (1.0 - cover) * base + cover * (0.8 * OrenNayar(dust, 0.6) + 0.2 * Sheen(dust, 0.6))
+
+
+def _over(colour: RGB, sigma: float, weight: float, lobe: Model) -> Model:
+    """A lobe of albedo up to `weight` over what it leaves to a rough diffuse body."""
+    return (1.0 - weight) * OrenNayar(colour, sigma) + weight * lobe
+
+
+def hazy(
+    reflectance: RGB, alpha: float, gamma: float, haze: float, wide: float, wide_gamma: float
+) -> Model:
+    """A sharp lobe and a wide one from one surface: haze of polish, wear, orange peel."""
+    sharp = GTR(1.0, reflectance, alpha, gamma)
+    return (1.0 - haze) * sharp + haze * GTR(1.0, reflectance, wide, wide_gamma)
+
+
+def pearl(
+    colour: RGB,
+    flakes: float,
+    tint: RGB,
+    film: float,
+    index: float,
+    fringes: float,
+    flake_alpha: float,
+    alpha: float,
+) -> Model:
+    """Interference flakes in a binder under a clear coat: the colour turns with the angle."""
+    flake = Interference(tint, flake_alpha, film, index, fringes)
+    base = flakes * flake + (1.0 - flakes) * Lambert(colour)
+    return Coated(base, alpha=alpha, eta=1.5)
+
+
+def retro_reflective(
+    colour: RGB, sigma: float, back: float, sharpness: float, specular: float, alpha: float
+) -> Model:
+    """Rough body that throws light back: road paint, moss, dry soil, coarse weave."""
+    tint = _scale(_desaturate(colour, 0.3), 1.0, normalise=0.9)
+    return (
+        (1.0 - back - specular) * OrenNayar(colour, sigma)
+        + back * RetroReflection(tint, sharpness)
+        + specular * GTR(1.0, 0.04, alpha, 1.5)
+    )
 
 
 # ---------------------------------------------------------------------------------------------
@@ -482,6 +532,123 @@ def _dusty(draw: _Draw) -> _Made:
     return f"dusty-{name}-{below}", dusty(base, dust, cover), values
 
 
+def _reflectance(draw: _Draw, metallic: bool) -> tuple[str, RGB]:
+    """Reflectance at normal incidence: of a metal, or of a dielectric, a little tinted at times."""
+    if not metallic:
+        r0 = draw.uniform(0.02, 0.12)
+        return "", (r0, r0, r0)
+    name = draw.pick(tuple(METALS))
+    eta, k = (np.array(values) for values in METALS[name])
+    r, g, b = (float(v) for v in fresnel_conductor(1.0, eta, k))
+    bare = draw.vary((r, g, b), 0.1)
+    if draw.uniform(0.0, 1.0) < 0.6:
+        return name, bare
+    # under a clear dye, which light passes twice or more: as saturated as candy wrappers
+    dye = draw.pick(COLOURS)
+    passes = draw.uniform(0.5, 2.0)
+    r, g, b = (
+        v * c**passes for v, c in zip(bare, _scale(COLOURS[dye], 1.0, normalise=1.0), strict=True)
+    )
+    return f"{dye}-{name}", (r, g, b)
+
+
+def _lobe_family(adjective: str, lobe: Callable[[_Draw, RGB], tuple[Model, Parameters]]) -> _Recipe:
+    """A lobe by itself as a metal, or over a body: each member draws which."""
+
+    def make(draw: _Draw) -> _Made:
+        metallic = draw.uniform(0.0, 1.0) < 0.35
+        noun, r0 = _reflectance(draw, metallic)
+        model, values = lobe(draw, r0)
+        values["reflectance"] = r0
+        if metallic:
+            # no metal is black beside its lobe: light bounces twice, and dust lies on it
+            share, stray = draw.uniform(0.5, 0.95), draw.log(0.003, 0.05)
+            values |= {"share": share, "stray": stray}
+            return f"{adjective}-{noun}", share * model + Lambert(stray), values
+        name, colour = draw.colour()
+        sigma, weight = draw.uniform(0.0, 0.8), draw.log(0.03, 0.9)
+        values |= {"colour": colour, "sigma": sigma, "weight": weight}
+        return f"{adjective}-{name}-enamel", _over(colour, sigma, weight, model), values
+
+    return make
+
+
+def _hazy(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
+    alpha = draw.spread(0.002, 0.6)
+    wide = min(1.0, alpha * draw.log(1.5, 60.0))
+    gamma, wide_gamma = draw.uniform(0.9, 3.5), draw.uniform(0.6, 3.0)
+    haze = draw.log(0.01, 0.8)
+    values: Parameters = {
+        "alpha": alpha, "gamma": gamma, "haze": haze, "wide": wide, "wide_gamma": wide_gamma
+    }  # fmt: skip
+    return hazy(r0, alpha, gamma, haze, wide, wide_gamma), values
+
+
+def _polished(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
+    b, c = 2.0 / draw.spread(0.002, 0.6) ** 2, draw.uniform(0.4, 2.5)
+    return ABC(1.0, r0, b, c), {"b": b, "c": c}
+
+
+def _shifted(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
+    alpha, p = draw.spread(0.002, 0.9), draw.uniform(0.2, 1.8)
+    return ShiftedGamma(1.0, r0, alpha, p), {"alpha": alpha, "p": p}
+
+
+def _blasted(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
+    alpha = draw.spread(0.02, 1.0)
+    if draw.uniform(0.0, 1.0) < 0.5:
+        return Beckmann(1.0, r0, alpha), {"alpha": alpha}
+    n = 2.0 / alpha**2
+    return BlinnPhong(1.0, r0, max(n, 1.0)), {"n": max(n, 1.0)}
+
+
+def _ward(draw: _Draw) -> _Made:
+    name, colour = draw.colour()
+    alpha, weight = draw.spread(0.01, 0.4), draw.log(0.01, 0.4)
+    values: Parameters = {"colour": colour, "alpha": alpha, "weight": weight}
+    return f"{_finish(alpha)}-{name}-lacquer", _over(colour, 0.2, weight, Ward(1.0, alpha)), values
+
+
+def _pearl(draw: _Draw) -> _Made:
+    name, colour = draw.colour()
+    tint = _scale(COLOURS[draw.pick(COLOURS)], 1.0, normalise=draw.uniform(0.4, 0.95))
+    tint = _desaturate(tint, draw.uniform(0.0, 1.0))
+    film, flakes = draw.uniform(0.0, 700.0), 1.0 - draw.log(0.005, 0.8)
+    index, fringes = draw.uniform(1.35, 2.4), draw.uniform(0.4, 1.0)
+    flake_alpha, alpha = draw.log(0.08, 0.6), draw.spread(0.004, 0.2)
+    values: Parameters = {
+        "colour": colour, "flakes": flakes, "tint": tint, "film": film,
+        "index": index, "fringes": fringes, "flake_alpha": flake_alpha, "alpha": alpha,
+    }  # fmt: skip
+    model = pearl(colour, flakes, tint, film, index, fringes, flake_alpha, alpha)
+    return f"pearl-{name}-paint", model, values
+
+
+def _retro(draw: _Draw) -> _Made:
+    name, colour = draw.colour()
+    sigma, back, sharpness = draw.uniform(0.2, 1.0), draw.log(0.02, 0.4), draw.log(1.0, 60.0)
+    specular, alpha = draw.log(0.02, 0.4), draw.spread(0.05, 0.8)
+    values: Parameters = {
+        "colour": colour, "sigma": sigma, "back": back, "sharpness": sharpness,
+        "specular": specular, "alpha": alpha,
+    }  # fmt: skip
+    model = retro_reflective(colour, sigma, back, sharpness, specular, alpha)
+    return f"beaded-{name}-coat", model, values
+
+
+def _worn(draw: _Draw) -> _Made:
+    """Two materials of other families side by side, finer than the eye: wear, rust, threads."""
+    others = [name for name in _RECIPES if name != "worn"]
+    share = draw.uniform(0.1, 0.9)
+    first, second = (others[int(i)] for i in draw.rng.choice(len(others), 2, replace=False))
+    (one, a, of_one), (two, b, of_two) = _RECIPES[first](draw), _RECIPES[second](draw)
+    values: Parameters = {"share": share}
+    for family, known in ((first, of_one), (second, of_two)):
+        values |= {f"{family}.{name}": value for name, value in known.items()}
+    words = one.split("-")[-1], two.split("-")[-1]
+    return f"worn-{words[0]}-and-{words[1]}", (1.0 - share) * a + share * b, values
+
+
 _NEUTRALS: Mapping[str, RGB] = MappingProxyType({name: COLOURS[name] for name in _NEUTRAL[:5]})
 _HIDES: Mapping[str, RGB] = MappingProxyType(
     {
@@ -535,6 +702,14 @@ _RECIPES: Mapping[str, _Recipe] = MappingProxyType(
         "wax": _wax,
         "greasy": _greasy,
         "dusty": _dusty,
+        "hazy": _lobe_family("hazy", _hazy),
+        "polished": _lobe_family("buffed", _polished),
+        "shifted-gamma": _lobe_family("burnished", _shifted),
+        "blasted": _lobe_family("blasted", _blasted),
+        "lacquer": _ward,
+        "pearl-paint": _pearl,
+        "retro-reflective": _retro,
+        "worn": _worn,
     }
 )
 
@@ -783,7 +958,7 @@ def _round_robin(anchors: list[Material]) -> list[Material]:
     return [anchors[i] for i in sorted(range(len(anchors)), key=keys.__getitem__)]
 
 
-def materials(seed: int = 0, count: int = 256) -> Iterator[Material]:
+def materials(seed: int = 0, count: int = 256, start: int = 0) -> Iterator[Material]:
     """Stream `count` materials: the anchors, then random members, family after family.
 
     A longer stream begins with the shorter one of the same seed, and any stretch of it spreads
@@ -795,21 +970,23 @@ def materials(seed: int = 0, count: int = 256) -> Iterator[Material]:
         Not negative.
     count : int
         At least 0; thousands are fine, nothing is kept.
+    start : int
+        Leave out so many of the `count`.
 
     Raises
     ------
     ValueError
     """
-    for name, value in (("seed", seed), ("count", count)):
+    for name, value in (("seed", seed), ("count", count), ("start", start)):
         if not isinstance(value, int | np.integer) or value < 0:
             raise ValueError(f"{name}: expected an integer of at least 0, got {value!r}")
-    return _stream(int(seed), int(count))
+    return _stream(int(seed), int(count), int(start))
 
 
-def _stream(seed: int, count: int) -> Iterator[Material]:
+def _stream(seed: int, count: int, start: int) -> Iterator[Material]:
     anchors = _round_robin(_anchors())
-    yield from anchors[:count]
-    for i in range(count - len(anchors)):
+    yield from anchors[start:count]
+    for i in range(max(start - len(anchors), 0), count - len(anchors)):
         step, turn = divmod(i, len(FAMILIES))
         family = FAMILIES[turn]
         name, model, parameters = _RECIPES[family](_Draw(seed, turn, step))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,46 +11,57 @@ from numpy.typing import NDArray
 
 from data_gen.families import materials
 from data_gen.labels import descriptors, labels, trait_values
-from traitbrdf.brdf import TabulatedBRDF
+from data_gen.tables import Progress, Tables
 from traitbrdf.embedding import GRID, BRDFEmbedding
 from traitbrdf.traits import TraitSpace
 
-COUNT = 400
+COUNT = 2040
 SEED = 0
-COMPONENTS = 8
+COMPONENTS = (14, 5)
 
 
 def build(
     count: int = COUNT,
     seed: int = SEED,
-    components: int = COMPONENTS,
-    progress: Callable[[str, float], None] | None = None,
+    components: tuple[int, int] = COMPONENTS,
+    progress: Progress | None = None,
+    folder: Path | None = None,
+    workers: int | str = 0,
 ) -> dict[str, NDArray[Any]]:
     """Tabulate the recipe, fit the embedding and the traits; all arrays of the artifact.
 
-    Memory: 0.24 MB a material for its table, and about three times that while fitting.
+    Parameters
+    ----------
+    count, seed : as for `materials`
+    components : as for `BRDFEmbedding`
+    progress : called with (stage, fraction); may raise to stop
+    folder : where tables are kept while they are needed, and after an interruption: 0.24 MB a
+        material; None is a temporary one
+    workers : as for `Tables.make`
+
+    Notes
+    -----
+    Memory does not grow with `count`, but for a kilobyte a material.
     """
+    embedding = BRDFEmbedding(components)  # bad numbers end here, before any work
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="traitbrdf-") as temporary:
+            return build(count, seed, components, progress, Path(temporary), workers)
     report = progress or (lambda stage, fraction: None)
-    tables, names, families, rows = [], [], [], []
-    for i, material in enumerate(materials(seed, count)):
-        table = TabulatedBRDF.from_model(material.model, GRID, material.name)
-        # interpolating a sharp lobe can add a percent of energy that its closed form has not
-        excess = table.max_albedo()
-        if excess > 1.0:
-            table = TabulatedBRDF(GRID, table.values / np.float32(excess), name=material.name)
-        tables.append(table)
-        names.append(material.name)
-        families.append(material.family)
-        rows.append(descriptors(table))
-        report("tabulating", (i + 1) / count)
+    tables = Tables(folder, count, seed, GRID)
+    tables.make(workers, progress)
     report("embedding", 0.0)
-    embedding = BRDFEmbedding(components).fit(tables)
     # coordinates of the embedding as it ships, with its rounded components
-    embedding = BRDFEmbedding.from_arrays(embedding.arrays())
-    coordinates = np.stack([embedding.encode(t) for t in tables]).astype(np.float32)
+    embedding = BRDFEmbedding.from_arrays(embedding.fit(tables).arrays())
+    encoded, rows = [], []
+    for table in tables:
+        encoded.append(embedding.encode(table))
+        rows.append(descriptors(table))
+    coordinates = np.stack(encoded).astype(np.float32)
     embedding.low_ = coordinates.min(axis=0).astype(np.float64)
     embedding.high_ = coordinates.max(axis=0).astype(np.float64)
     report("embedding", 1.0)
+    families = [material.family for material in materials(seed, count)]
     marks = {name: labels(values) for name, values in trait_values(rows).items()}
     space = TraitSpace.fit(
         coordinates, marks, embedding.low_, embedding.high_, families, embedding.body_rows()
@@ -58,7 +70,7 @@ def build(
     return {
         **embedding.arrays(),
         **space.arrays(),
-        "names": np.array(names),
+        "names": np.array(tables.names),
         "families": np.array(families),
         "coordinates": coordinates,
         "labels": np.stack([marks[name] for name in space.names]),

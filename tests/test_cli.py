@@ -125,7 +125,7 @@ def test_render_by_the_oracle_agrees(tmp_path: Path) -> None:
 def test_info(tmp_path: Path, shared_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info"]) == 0
     said = capsys.readouterr().out
-    assert "400 materials" in said
+    assert "2040 materials" in said
     assert "red-rubber" in said
     write_exr(tmp_path / "grey.exr", np.full((4, 8, 3), 0.5, np.float32))
     assert main(["info", str(tmp_path / "grey.exr")]) == 0
@@ -138,6 +138,7 @@ def test_info(tmp_path: Path, shared_data: Path, capsys: pytest.CaptureFixture[s
     ("name", "expected"),
     [
         ("table", ["table error, median"]),
+        ("embedding", ["decoding the cells of a scene", "decoding a full table"]),
         ("shadows", ["error in the shade, median", "a one-texel sun: lit or dark as a ray says"]),
         pytest.param(
             "transport",
@@ -181,7 +182,7 @@ def test_bench_writes_records(
         assert np.isfinite(record["value"])
         assert (record["target"] is None) == (record["met"] is None)
         if record["unit"] == "ms":  # what is timed was checked
-            assert 0.0 < record["error"] < 0.05
+            assert 0.0 <= record["error"] < 0.05
     named = {record["name"] for record in records}
     assert set(expected) <= named
     said = capsys.readouterr().out

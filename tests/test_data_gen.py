@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from data_gen import __main__ as command
-from data_gen import packing
-from data_gen.families import materials
+from data_gen import packing, tables
+from data_gen.families import FAMILIES, materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.packing import build
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
@@ -52,7 +52,7 @@ def test_what_the_package_ships():
     assert all(np.isfinite(v).all() for v in shipped.values() if v.dtype.kind == "f")
     count = len(shipped["names"])
     assert count == packing.COUNT
-    assert shipped["coordinates"].shape == (count, 3 * packing.COMPONENTS)
+    assert shipped["coordinates"].shape == (count, 24)
     assert shipped["labels"].shape == (len(shipped["trait_names"]), count)
     assert np.all(shipped["coordinates"] >= shipped["low"].astype(np.float32))
     assert np.all(shipped["coordinates"] <= shipped["high"].astype(np.float32))
@@ -67,12 +67,12 @@ def test_what_the_package_ships():
 @pytest.fixture(scope="module")
 def small():
     told = []
-    arrays = build(30, seed=3, components=4, progress=lambda *news: told.append(news))
+    arrays = build(30, seed=3, components=(4, 4), progress=lambda *news: told.append(news))
     return arrays, told
 
 
 def test_a_build_is_deterministic(small):
-    again = build(30, seed=3, components=4)
+    again = build(30, seed=3, components=(4, 4))
     assert list(again) == list(small[0])
     for name, value in small[0].items():
         np.testing.assert_array_equal(again[name], value, err_msg=name)
@@ -97,6 +97,14 @@ def test_a_build_can_be_used(small):
 def test_another_seed_makes_other_materials():
     drawn = [[m.name for m in materials(seed, 150)] for seed in (0, 1)]
     assert drawn[0] != drawn[1]
+
+
+def test_the_documented_families_are_those_of_the_recipe():
+    text = (ROOT / "docs" / "library.md").read_text()
+    assert f"{packing.COUNT:,} materials of {len(FAMILIES)} families" in text
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| ")][1:]
+    named = [name.strip() for row in rows for name in row.split(",")]
+    assert sorted(named) == sorted(FAMILIES)
 
 
 # -- labels -----------------------------------------------------------------------------------
@@ -164,7 +172,8 @@ def test_labels_are_thirds():
 def test_the_command_as_a_process(tmp_path):
     out = tmp_path / "library.npz"
     shipped = (ROOT / "traitbrdf" / "data" / "library.npz").read_bytes()
-    call = [sys.executable, "-W", "error", "-m", "data_gen", "--count", "40", "--out", str(out)]
+    call = [sys.executable, "-W", "error", "-m", "data_gen", "--count", "40", "--out", str(out),
+            "--tables", str(tmp_path / "tables")]  # fmt: skip
     done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "40 materials, 24 coordinates" in done.stdout
@@ -173,17 +182,72 @@ def test_the_command_as_a_process(tmp_path):
 
 
 def test_an_interruption_leaves_no_file(tmp_path, monkeypatch, capsys):
-    def interrupted(count, seed, components, progress):
+    def interrupted(count, seed, components, progress, folder, workers):
         def stop(stage, fraction):
             progress(stage, fraction)
             raise KeyboardInterrupt
 
-        return build(count, seed, components, stop)
+        return build(count, seed, components, stop, folder, workers)
 
     monkeypatch.setattr(command, "build", interrupted)
-    assert command.main(["--count", "40", "--out", str(tmp_path / "library.npz")]) == 1
-    assert list(tmp_path.iterdir()) == []
-    assert "interrupted; nothing was written" in capsys.readouterr().err
+    call = ["--count", "40", "--out", str(tmp_path / "a.npz"), "--tables", str(tmp_path / "t")]
+    assert command.main(call) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["t"]
+    assert "interrupted; " in capsys.readouterr().err
+
+
+class EnoughError(Exception):
+    pass
+
+
+def test_tables_go_on_where_they_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "PIECE", 8)
+
+    def stop(stage, fraction):
+        if fraction >= 0.5:
+            raise EnoughError
+
+    some = tables.Tables(tmp_path / "some", 30, 3, COARSE)
+    with pytest.raises(EnoughError):
+        some.make(progress=stop)
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "some").iterdir()}
+    assert len(made) == 2
+    told = []
+    some = tables.Tables(tmp_path / "some", 30, 3, COARSE)
+    some.make(progress=lambda *news: told.append(news))
+    assert told == [("tabulating", f) for f in (0.5, 0.75, 1.0)]
+    assert all(path.stat().st_mtime_ns == time for path, time in made.items())
+    whole = tables.Tables(tmp_path / "whole", 30, 3, COARSE)
+    whole.make()
+    assert len(whole) == 30
+    for a, b, m in zip(some, whole, materials(3, 30), strict=True):
+        assert a.name == b.name == m.name
+        np.testing.assert_array_equal(a.values, b.values)
+        np.testing.assert_array_equal(a.values, tables.table_of(m, COARSE).values)
+    assert whole.missing() == []
+    # another seed and another grid are other tables
+    assert len(tables.Tables(tmp_path / "whole", 30, 4, COARSE).missing()) == 4
+    assert len(tables.Tables(tmp_path / "whole", 30, 3, HalfDiffGrid(9, 4, 3)).missing()) == 4
+    whole.remove()
+    assert not (tmp_path / "whole").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # the cluster's own warnings are not ours
+def test_workers_make_the_same_tables(tmp_path, monkeypatch):
+    one = tables.Tables(tmp_path / "one", 100, 0, COARSE)
+    one.make()
+    two = tables.Tables(tmp_path / "two", 100, 0, COARSE)
+    two.make(workers=2)
+    assert two.missing() == []
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a.values, b.values)
+
+
+def test_a_stretch_of_the_recipe_is_that_of_the_whole():
+    whole = list(materials(5, 140))
+    for start, stop in ((0, 30), (30, 80), (64, 66), (100, 140)):
+        assert list(materials(5, stop, start)) == whole[start:stop]
 
 
 @pytest.mark.parametrize(
@@ -193,13 +257,13 @@ def test_an_interruption_leaves_no_file(tmp_path, monkeypatch, capsys):
         (["--count", "0"], "tables: expected at least two"),
         (["--count", "-1"], "count"),
         (["--seed", "-1"], "seed"),
-        (["--count", "4", "--components", "0"], "n_components"),
-        (["--count", "4", "--components", "12"], "n_components"),
+        (["--count", "4", "--components", "0", "1"], "n_components"),
+        (["--count", "4", "--components", "4", "1"], "n_components"),
     ],
 )
 def test_one_readable_line_for_a_mistake(tmp_path, capsys, arguments, match):
     out = tmp_path / "library.npz"
-    assert command.main([*arguments, "--out", str(out)]) == 1
+    assert command.main([*arguments, "--out", str(out), "--tables", str(tmp_path / "t")]) == 1
     told = capsys.readouterr().err.strip().splitlines()
     assert told[-1].startswith("data_gen: ")
     assert match in told[-1]
@@ -207,10 +271,11 @@ def test_one_readable_line_for_a_mistake(tmp_path, capsys, arguments, match):
 
 
 def test_a_folder_that_is_not_there(tmp_path, capsys, monkeypatch, small):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(command, "build", lambda *arguments: small[0])
     assert command.main(["--out", str(tmp_path / "nowhere" / "library.npz")]) == 1
     assert "data_gen: " in capsys.readouterr().err
-    assert command.main(["--components", "4", "--out", str(tmp_path / "library.npz")]) == 0
+    assert command.main(["--components", "4", "4", "--out", str(tmp_path / "library.npz")]) == 0
     assert "30 materials" in capsys.readouterr().out
 
 

@@ -28,7 +28,7 @@ def test_count_names_and_families(library):
     families = Counter(m.family for m in library)
     assert set(families) == set(FAMILIES)
     assert len(FAMILIES) >= 12
-    assert min(families.values()) >= 8
+    assert min(families.values()) >= 5
 
 
 def test_anchors_come_first(library):
@@ -41,7 +41,7 @@ def test_anchors_come_first(library):
 
 def test_every_prefix_is_varied(library):
     assert len({m.family for m in library[:26]}) == 26
-    assert len({m.family for m in library[100:126]}) == 26
+    assert len({m.family for m in library[100:134]}) == 34
 
 
 def test_deterministic_and_prefix_consistent(library):

@@ -27,10 +27,10 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf import editing, models, reference
-from traitbrdf.brdf import Reflectance, TabulatedBRDF
-from traitbrdf.directions import to_local
+from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.directions import from_half_diff_angles, to_local
 from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession, trusted_error
-from traitbrdf.embedding import Library, default_library
+from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
 from traitbrdf.lights import EnvironmentMap, texel_moments
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.scene import Camera, Scene
@@ -101,7 +101,8 @@ def maps(data: Path | None, quick: bool) -> list[tuple[str, EnvironmentMap]]:
 
 def training_set(library: Library, quick: bool) -> Training:
     """What a session trains its bases with, but for every tenth member; a third of it if quick."""
-    kept = [z for i, z in enumerate(library.coordinates) if i % HELD_OUT]
+    members = editing.trained_members(library)
+    kept = [library.coordinates[i] for i in members if i % HELD_OUT]
     channels = [library.embedding.decode_values(z) for z in (kept[::3] if quick else kept)]
     whole = training_tables(np.concatenate(channels, axis=1), library.embedding.grid_)
     if not quick:
@@ -633,6 +634,101 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     yield Record("table error, maximum", 100.0 * float(np.max(error)), "%", how=how)
 
 
+def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
+    """Embedding error: measured materials that the library knows nothing of, and decoding times."""
+    library = default_library()
+    embedding = library.embedding
+    grid, k = embedding.grid_, embedding.size
+    if data is not None:
+        with np.load(data / "merl_slices" / "merl_phi_d_90.npz") as file:
+            slices = file["values"].astype(np.float64)
+        h, d = np.meshgrid(
+            (np.arange(90) / 90) ** 2 * math.pi / 2, np.radians(np.arange(90)), indexing="ij"
+        )
+        trusted = np.cos(h) * np.cos(d) > math.cos(_TRUSTED)
+        angles = h[trusted], d[trusted], np.full(trusted.sum(), math.pi / 2)
+        peak = angles[0] < math.radians(10.0)
+        errors = [_log_error(embedding, angles, values[trusted]) for values in slices]
+        how = f"median |d log f| within 75 degrees, {len(slices)} MERL slices, {k} numbers each"
+        for part, inside, limits in (
+            ("MERL", np.full(len(peak), True), (0.07, 0.13)),
+            ("MERL highlights", peak, (0.15, 0.35)),
+        ):
+            medians = [np.median(e[inside]) for e in errors]
+            for name, quantile, limit in zip(("median", "90th"), (0.5, 0.9), limits, strict=True):
+                value = float(np.quantile(medians, quantile))
+                yield Record.at_most(f"{part}, {name}", value, "", limit, how=how)
+        th, td, pd = (
+            a.ravel()
+            for a in np.meshgrid(
+                (np.arange(90) / 90) ** 2 * math.pi / 2,
+                (np.arange(24) + 0.5) / 24 * math.pi / 2,
+                (np.arange(9) + 0.5) / 9 * math.pi / 2,
+                indexing="ij",
+            )
+        )
+        wi, wo = from_half_diff_angles(th, td, pd)
+        trusted = np.minimum(wi[:, 2], wo[:, 2]) > math.cos(_TRUSTED)
+        medians = []
+        for path in sorted((data / "rgl").glob("*.bsdf")):
+            rgb = np.maximum(MeasuredBRDF.read(path).eval(wi[trusted], wo[trusted]), 0.0)
+            error = _log_error(embedding, (th[trusted], td[trusted], pd[trusted]), rgb)
+            medians.append(float(np.median(error)))
+            say(f"  {path.stem}: {medians[-1]:.3f}")
+        how = f"median |d log f| within 75 degrees, {len(medians)} RGL materials, {k} numbers each"
+        yield Record.at_most("RGL, median", float(np.median(medians)), "", 0.12, how=how)
+        yield Record("RGL, maximum", max(medians), "", how=how)
+    z = library.coordinates[library.index("blue-plastic")]
+    rng = np.random.default_rng(0)
+    cells = np.sort(rng.choice(grid.size, min(16_000, grid.size), replace=False))
+    full, fine = embedding.decode(z), HalfDiffGrid.merl()
+    away = np.abs(embedding.decode_values(z, None, cells) - full.values.reshape(-1, 3)[cells])
+    yield Record.at_most(
+        "decoding the cells of a scene",
+        _milliseconds(lambda: embedding.decode_values(z, None, cells), 5 if quick else 60),
+        "ms",
+        1.0,
+        error=float(away.sum() / full.values.reshape(-1, 3)[cells].sum()),
+        how=f"{len(cells)} cells, energy checked; error: by the whole table",
+    )
+    cosine = embedding.weight_.reshape(*grid.shape, 1) ** 2
+    away = np.abs(embedding.decode(z, fine).regrid(grid).values - full.values) * cosine
+    yield Record.at_most(
+        "decoding a full table",
+        _milliseconds(lambda: embedding.decode(z, fine), 1 if quick else 9),
+        "ms",
+        100.0,
+        error=float(away.sum() / (full.values * cosine).sum()),
+        how=f"grid {fine.shape}; error: there and back, by the lower cosine",
+    )
+
+
+_TRUSTED = math.radians(75.0)
+"""Beyond this angle measurements are extrapolated or unreliable."""
+
+
+def _log_error(
+    embedding: BRDFEmbedding, angles: tuple[Float64, Float64, Float64], rgb: Float64
+) -> Float64:
+    """|d log(f + 1e-3)| (n, 3) of samples that were encoded and decoded again."""
+    index, weight = embedding.grid_.stencil(*angles)
+    table = embedding.decode_values(embedding.encode_samples(*angles, rgb))
+    shown = np.einsum("nk,nkc->nc", weight, table[index])
+    error: Float64 = np.abs(np.log(shown + FLOOR) - np.log(np.maximum(rgb, 0.0) + FLOOR))
+    return error
+
+
+def _milliseconds(call: Callable[[], object], repeats: int) -> float:
+    """Median time of a call, after one that does not count."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times))
+
+
 # -- edits ----------------------------------------------------------------------------------------
 
 
@@ -896,6 +992,7 @@ BENCHES: dict[str, Callable[[Path | None, bool, Say], Iterator[Record]]] = {
     "families": family_error,
     "shadows": shadow_error,
     "table": table_error,
+    "embedding": embedding_error,
     "edit": edit_speed,
     "prepare": preparation,
 }

@@ -372,8 +372,9 @@ def _info(given: argparse.Namespace) -> int:
         kept = float(embedding.explained_variance_ratio_.sum())
         print(f"traitbrdf {tb.__version__}")
         print(f"library: {len(library)} materials of {len(set(library.families))} families")
+        grey, colour = embedding.n_components
         print(
-            f"embedding: {embedding.size} coordinates ({embedding.n_components} a colour axis), "
+            f"embedding: {embedding.size} coordinates ({grey} grey, twice {colour} of colour), "
             f"{100 * kept:.2f} % of the variance of log f, grid {embedding.grid_.shape}"
         )
         print(f"traits: {', '.join(space.names)}")

@@ -84,6 +84,9 @@ as much: it is lost in the frame's, and an exact frame would take a thousand tim
 TRAINED_IMAGES = 8
 """At most so many exact images are taken into a basis."""
 
+TRAINED_MEMBERS = 400
+"""Members of the library that a basis is fitted to: more of them span little more."""
+
 DRAFT_SIZE = 128
 """Pixels along the longer side of a draft."""
 
@@ -1628,10 +1631,18 @@ def _prepare(
     return _Prepared(transport, False, fixed)
 
 
+def trained_members(library: Library) -> list[int]:
+    """Which members of a library bases are fitted to: `TRAINED_MEMBERS` of them, evenly spread."""
+    # neighbours of the recipe are of different families: any even choice has them all
+    return sorted({int(i) for i in np.linspace(0, len(library) - 1, TRAINED_MEMBERS)})
+
+
 @functools.lru_cache(maxsize=1)
 def _training(library: Library, seed: int) -> Training:
     """The training set of a library; kept, since every new view or light needs it again."""
-    channels = [library.embedding.decode_values(z) for z in library.coordinates]
+    channels = [
+        library.embedding.decode_values(library.coordinates[i]) for i in trained_members(library)
+    ]
     return training_tables(np.concatenate(channels, axis=1), library.embedding.grid_, seed)
 
 

@@ -1,21 +1,22 @@
 """The embedding: BRDFs as points of a low-dimensional space (after Matusik et al. 2003).
 
-A table's values are mapped by y = log(f + FLOOR), and a PCA over the library's tables gives the
-mean and the components. Matusik et al. ("A Data-Driven Reflectance Model", SIGGRAPH 2003) take
-one vector of all colours for each material; here every colour channel is a sample of its own, so
-that one basis serves the three channels (a third of the numbers to decode) and no colour is
-favoured by the colours in the library. With m components a material has k = 3 m coordinates:
-the m achromatic ones first (the channels' mean), then m for red against blue, then m for green
-against magenta; each axis is scaled to unit variance over channels.
+A table's values are mapped by y = log(f + FLOOR). Matusik et al. ("A Data-Driven Reflectance
+Model", SIGGRAPH 2003) take one vector of all colours for each material; here the mean of the three
+channels' logarithms and their differences (red against blue, green against magenta) are embedded
+apart, by two PCAs: materials differ in many ways in shape and in few in colour. With m = (14, 5)
+components a material has k = 24 coordinates: 14 achromatic ones first, then 5 for red against blue,
+then 5 for green against magenta; each axis is scaled to unit variance.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
+import scipy.optimize
 import torch
 from numpy.typing import ArrayLike, NDArray
 
@@ -45,6 +46,19 @@ _CAP = 30.0
 
 _MARGIN = 1.0 + 1e-6
 """What scaled tables stay below albedo 1 by, so that rounding does not lift them above it."""
+
+_BATCH = 128
+"""Materials that are held in memory at once while fitting."""
+
+_NOISE = 0.1
+"""Assumed deviation of log f from the manifold, where samples are encoded."""
+
+_ROUNDS = 25
+"""At most so many times are the weights of samples found anew."""
+
+_ROBUST = 0.03
+"""Deviation of log f beyond which a sample counts less, as the inverse of it: what is nearly the
+least sum of absolute deviations follows most samples, not the worst."""
 
 _TIE = 1e-6
 """Relative distance at which two albedos count as equal: the channels of a grey material."""
@@ -81,7 +95,7 @@ class _Tensors(NamedTuple):
     check: torch.Tensor
     low: torch.Tensor
     high: torch.Tensor
-    opponent: torch.Tensor
+    mixing: torch.Tensor
 
 
 class BRDFEmbedding:
@@ -89,77 +103,123 @@ class BRDFEmbedding:
 
     Parameters
     ----------
-    n_components : int
-        Components for each colour channel, m; a material has 3 m coordinates.
+    n_components : (int, int)
+        Components of the mean of the channels, and of each of the two colour axes: (14, 5) makes
+        14 + 2 * 5 coordinates. One number stands for both.
 
     Attributes
     ----------
     grid_ : HalfDiffGrid
     mean_ : (cells,) float32, mean of log(f + FLOOR)
-    components_ : (cells, m) float32
+    components_ : (cells, m) float32, those of the mean of the channels first
     weight_ : (cells,) float32
         What a cell counts in the fit: the square root of the lower cosine, 0 below the horizon.
-    low_, high_ : (3 m,) float64
+    low_, high_ : (k,) float64
         The gamut box: the range of the library's coordinates.
-    explained_variance_ratio_ : (m,) float64
+    explained_variance_ratio_ : (m,) float64, of the whole variance
     """
 
-    def __init__(self, n_components: int = 8) -> None:
-        if not isinstance(n_components, int) or n_components < 1:
-            raise ValueError(f"n_components: expected a positive integer, got {n_components!r}")
-        self.n_components = n_components
-
-    def fit(self, tables: Sequence[TabulatedBRDF]) -> BRDFEmbedding:
-        """Fit to a library of at least two tables on one grid; returns self."""
-        from sklearn.decomposition import PCA  # slow to import, and needed only here
-
-        if len(tables) < 2:
-            raise ValueError(f"tables: expected at least two, got {len(tables)}")
-        grid = tables[0].grid
-        if any(t.grid != grid for t in tables):
-            raise ValueError("tables: expected all on one grid, got several")
-        if grid.layout != "folded":
-            raise ValueError(f"tables: expected the 'folded' layout, got {grid.layout!r}")
-        if 3 * len(tables) <= self.n_components:
+    def __init__(self, n_components: int | tuple[int, int] = (14, 5)) -> None:
+        try:
+            pair = (n_components,) * 2 if isinstance(n_components, int) else tuple(n_components)
+        except TypeError:
+            pair = ()
+        if len(pair) != 2 or not all(
+            isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in pair
+        ):
             raise ValueError(
-                f"n_components: expected fewer than the {3 * len(tables)} channels of the "
-                f"library, got {self.n_components}"
+                f"n_components: expected one or two positive integers, got {n_components!r}"
             )
-        logs = np.concatenate([_log_map(t.values).reshape(-1, 3).T for t in tables])
-        self.grid_ = grid
-        self.weight_ = _cell_weight(grid)
-        # randomised, but converged: a full SVD of this matrix takes a minute where floats underflow
-        pca = PCA(
-            self.n_components,
-            svd_solver="randomized",
-            iterated_power=10,
-            n_oversamples=24,
-            random_state=0,
-        )
-        scores = pca.fit_transform(logs * self.weight_)
-        deviation = np.sqrt(pca.explained_variance_)
-        if deviation.min() <= 1e-5 * max(1.0, float(deviation.max())):
+        self.n_components = (int(pair[0]), int(pair[1]))
+        self._mixing = _mixing(self.n_components)
+
+    def fit(self, tables: Iterable[TabulatedBRDF]) -> BRDFEmbedding:
+        """Fit to a library of at least two tables on one grid; returns self.
+
+        Parameters
+        ----------
+        tables : iterable of TabulatedBRDF
+            Anything but an iterator may be larger than memory: it is gone through four times, and
+            128 tables are held at once.
+
+        Raises
+        ------
+        ValueError
+            If there are too few tables, of several grids, or too alike.
+        """
+        if isinstance(tables, Iterator):
+            tables = list(tables)
+        self.grid_, count = _checked_grid(tables)
+        achromatic, chromatic = self.n_components
+        if count <= max(achromatic, chromatic):
             raise ValueError(
-                f"tables: expected at least {self.n_components + 1} different channels, "
-                f"got tables that span {int(np.sum(deviation > 1e-5))} dimensions"
+                f"n_components: expected fewer than the {count} tables of the library, "
+                f"got {self.n_components}"
             )
-        scores = scores / deviation
-        self.explained_variance_ratio_ = np.asarray(pca.explained_variance_ratio_, np.float64)
-        # loadings by regression on the scores, so that cells below the horizon have them too
-        self.mean_ = logs.mean(axis=0).astype(np.float32)
-        gram = scores.T @ scores
-        self.components_ = np.linalg.solve(gram, scores.T @ (logs - self.mean_)).T
-        self.components_ = np.ascontiguousarray(self.components_, np.float32)
+        self.weight_ = _cell_weight(self.grid_)
+        total = np.zeros(self.grid_.size)
+        for logs in _batches(tables):
+            total += logs.sum(axis=(0, 1))
+        self.mean_ = (total / (3 * count)).astype(np.float32)
+        grey = self._axes(tables, slice(0, 1), achromatic, count)
+        # both signs: the mean is grey, whatever colours the library prefers
+        colour = self._axes(tables, slice(1, 3), chromatic, count)
+        self.components_ = np.concatenate([grey[0], colour[0]], axis=1)
+        variance = np.concatenate([grey[1], 2.0 * colour[1]])
+        self.explained_variance_ratio_ = variance / (grey[2] + 2.0 * colour[2])
         self._prepare()
-        coordinates = np.stack([self.encode(t) for t in tables])
+        encoded = (self.encode(table) for table in tables)
+        coordinates = np.stack(list(encoded))
         self.low_, self.high_ = coordinates.min(axis=0), coordinates.max(axis=0)
         return self
 
+    def _axes(
+        self, tables: Iterable[TabulatedBRDF], axes: slice, count: int, materials: int
+    ) -> tuple[Float32, Float64, float]:
+        """Components (cells, count) of some of the three colour axes, their variances, and the
+        variance in all."""
+        from sklearn.decomposition import IncrementalPCA  # slow to import, and needed only here
+
+        offset = math.sqrt(3.0) * self.mean_ if axes.start == 0 else np.float32(0.0)
+
+        def rows() -> Iterator[Float32]:
+            for logs in _batches(tables):
+                turned = np.einsum("ac,ncx->nax", _OPPONENT[axes].astype(np.float32), logs) - offset
+                yield turned.reshape(-1, logs.shape[2])
+
+        signs = 1 if axes.start == 0 else 2
+        some = min(materials, _BATCH) * (axes.stop - axes.start) * signs
+        pca = IncrementalPCA(min(4 * count + 16, some, self.grid_.size))
+        for batch in rows():
+            weighted = batch * self.weight_
+            with np.errstate(invalid="ignore", divide="ignore"):  # shares of no variance at all
+                pca.partial_fit(np.concatenate([weighted, -weighted]) if signs == 2 else weighted)
+        variance = np.asarray(pca.explained_variance_[:count], np.float64)
+        deviation = np.sqrt(variance)
+        if deviation.min() <= 1e-5 * max(1.0, float(deviation.max())):
+            raise ValueError(
+                f"tables: expected at least {count + 1} different ones on every colour axis, "
+                f"got tables that span {int(np.sum(deviation > 1e-5))} dimensions of one"
+            )
+        # loadings by regression on the scores, so that cells below the horizon have them too
+        gram = np.zeros((count, count))
+        cross = np.zeros((count, self.grid_.size))
+        for batch in rows():
+            scores = (batch * self.weight_) @ pca.components_[:count].T / deviation
+            gram += scores.T @ scores
+            cross += scores.T @ batch
+        loadings = np.linalg.solve(gram, cross).T
+        total = float(np.sum(pca.var_))
+        shares = np.asarray(pca.explained_variance_ratio_[:count], np.float64)
+        return np.ascontiguousarray(loadings, np.float32), total * shares, total
+
     def _prepare(self) -> None:
         """What follows from the fitted state: the projection and the albedo check."""
-        weighted = (self.components_ * self.weight_[:, None]).astype(np.float64)
-        self._gram = weighted.T @ weighted
-        self._project = np.linalg.solve(self._gram, (weighted * self.weight_[:, None]).T)
+        squared = (self.weight_.astype(np.float64) ** 2)[:, None]
+        self._project = []
+        for own in np.split(self.components_.astype(np.float64), [self.n_components[0]], axis=1):
+            weighted = own * squared
+            self._project.append(np.linalg.solve(weighted.T @ own, weighted.T))
         self._albedo = albedo_operator(self.grid_, ALBEDO_ANGLES).astype(np.float32)
         # the energy check by itself, for when only some cells are decoded: three quarters of the
         # grid, so a dense product is faster than the sparse one
@@ -169,7 +229,8 @@ class BRDFEmbedding:
         self._checked = _Rows(
             checked, np.ascontiguousarray(self.components_[checked].T), self.mean_[checked]
         )
-        self._fan = np.kron(_OPPONENT.T.reshape(1, 9), np.eye(self.n_components)).astype(np.float32)
+        fan = self._mixing.transpose(1, 0, 2).reshape(self.components_.shape[1], -1)
+        self._fan = np.ascontiguousarray(fan, np.float32)
         self._tensors: dict[tuple[torch.device, torch.dtype], _Tensors] = {}
 
     def __repr__(self) -> str:
@@ -179,7 +240,7 @@ class BRDFEmbedding:
     @property
     def size(self) -> int:
         """k, the number of coordinates of a material."""
-        return 3 * self.n_components
+        return self.n_components[0] + 2 * self.n_components[1]
 
     def _fitted(self) -> None:
         if not hasattr(self, "components_"):
@@ -215,24 +276,56 @@ class BRDFEmbedding:
             table = brdf.regrid(self.grid_)
         else:
             table = TabulatedBRDF.from_model(brdf, self.grid_)
-        scores = self._project @ (_log_map(table.values).reshape(-1, 3) - self.mean_[:, None])
-        return self._to_coordinates(scores)
+        logs = _log_map(table.values).reshape(-1, 3) - self.mean_[:, None]
+        grey, red_blue, green = (logs @ _OPPONENT.T).T
+        achromatic, chromatic = self._project
+        return np.concatenate([achromatic @ grey, chromatic @ red_blue, chromatic @ green])
+
+    @overload
+    def encode_samples(
+        self,
+        theta_h: ArrayLike,
+        theta_d: ArrayLike,
+        phi_d: ArrayLike,
+        rgb: ArrayLike,
+        return_std: Literal[False] = False,
+    ) -> Float64: ...
+
+    @overload
+    def encode_samples(
+        self,
+        theta_h: ArrayLike,
+        theta_d: ArrayLike,
+        phi_d: ArrayLike,
+        rgb: ArrayLike,
+        return_std: Literal[True],
+    ) -> tuple[Float64, Float64]: ...
 
     def encode_samples(
-        self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike, rgb: ArrayLike
-    ) -> Float64:
-        """Coordinates (k,) of scattered or masked measurements.
+        self,
+        theta_h: ArrayLike,
+        theta_d: ArrayLike,
+        phi_d: ArrayLike,
+        rgb: ArrayLike,
+        return_std: bool = False,
+    ) -> Float64 | tuple[Float64, Float64]:
+        """Coordinates (k,) of scattered or masked measurements, within the gamut box.
 
         Parameters
         ----------
         theta_h, theta_d, phi_d : (n,) array_like, radians
         rgb : (n, 3) array_like
             f_r in 1/sr without the cosine; rows that are negative or not finite are left out.
+        return_std : bool
+            Also return the standard deviation (k,) of each coordinate: near 1 (the library's own)
+            where the samples say nothing of it.
 
         Notes
         -----
-        A ridge whose prior is the library's unit variance keeps what the samples do not determine
-        near the mean; 0.1 is the assumed deviation of log f from the manifold.
+        Outliers among the samples count little: iteratively reweighted least squares, nearly the
+        least sum of absolute deviations of log f. A ridge whose prior is the library's unit
+        variance keeps what the samples do not determine near the mean; 0.1 is the assumed deviation
+        of log f from the manifold.
 
         Raises
         ------
@@ -256,13 +349,27 @@ class BRDFEmbedding:
         mean = np.einsum("nk,nk->n", corner, self.mean_[index].astype(np.float64))
         target = np.log(values[valid] + FLOOR) - mean[:, None]
         # many samples of one measurement are not independent: count at most a thousand
-        precision = min(1.0, 1000.0 / len(target)) / 0.1**2
-        gram = precision * (basis.T @ basis) + np.eye(self.n_components)
-        return self._to_coordinates(np.linalg.solve(gram, precision * (basis.T @ target)))
-
-    def _to_coordinates(self, scores: Float64) -> Float64:
-        """(m, 3) channel scores to (3 m,) coordinates."""
-        return np.asarray((_OPPONENT @ scores.T).ravel(), np.float64)
+        precision = min(1.0, 1000.0 / len(target)) / _NOISE**2
+        weight = np.full(target.shape, precision)
+        z: Float64 = np.zeros(self.size)
+        for _ in range(_ROUNDS):
+            gram, pull = np.eye(self.size), np.zeros(self.size)
+            for mixing, w, t in zip(self._mixing, weight.T, target.T, strict=True):
+                gram += mixing.T @ ((basis * w[:, None]).T @ basis) @ mixing
+                pull += mixing.T @ (basis.T @ (w * t))
+            before, z = z, np.asarray(np.linalg.solve(gram, pull), np.float64)
+            if np.abs(z - before).max() < 1e-4:
+                break
+            away = np.abs(target - basis @ (self._mixing @ z).T)
+            weight = precision * _ROBUST / np.maximum(away, _ROBUST)
+        if np.any((z < self.low_) | (z > self.high_)):
+            # the best point of the gamut, which the nearest one is not
+            root = np.linalg.cholesky(gram)
+            aim = np.linalg.solve(root, pull)
+            z = scipy.optimize.lsq_linear(root.T, aim, (self.low_, self.high_)).x
+        if not return_std:
+            return z
+        return z, np.sqrt(np.diag(np.linalg.inv(gram)))
 
     def clip(self, z: ArrayLike) -> Float64:
         """The nearest point (k,) in the gamut box."""
@@ -338,19 +445,20 @@ class BRDFEmbedding:
         clipped = self.clip(point)
         self._check_offset(offset)
         rows = self._rows(cells)
-        scores = _channel_scores(_OPPONENT, clipped).astype(np.float32)
+        scores = (self._mixing @ clipped).astype(np.float32)
         logs = rows.logs(scores, offset)
         albedo = self._check_albedos(scores, offset)
         greatest = float(albedo.max())
         scale = 1.0 / (greatest * _MARGIN) if greatest > 1.0 else 1.0
-        # d log(f + FLOOR) of colour c, coordinate (axis a, component m) is opponent[a, c] basis[m]
+        # d log(f + FLOOR) of colour c by a coordinate is the sum of mixing[c, m] basis[m]
         result: Float32 = (rows.basis.T @ self._fan).reshape(-1, 3, self.size)
         result *= (_slope(logs) * np.float32(scale)).T[..., None]
         if greatest > 1.0:
             tied = _tied(albedo)
             weight = (tied / np.float32(tied.sum())) @ self._check.T
             weight *= _slope(self._checked.logs(scores, offset))
-            rise = self._to_coordinates(self._checked.basis @ weight.T).astype(np.float32)
+            by_score = (self._checked.basis @ weight.T).T[..., None]
+            rise = np.sum(by_score * self._mixing, axis=(0, 1)).astype(np.float32)
             values = _reflectance(np, logs, out=logs) * np.float32(scale / greatest)
             result -= values.T[..., None] * rise
         result[..., point != clipped] = 0.0
@@ -400,7 +508,7 @@ class BRDFEmbedding:
         if cells is not None:
             index = torch.tensor(self._cell_indices(cells), device=z.device)
             rows = _Rows(index, rows.basis[:, index], rows.mean[index])
-        scores = _channel_scores(on.opponent, torch.clamp(z, on.low, on.high))
+        scores = on.mixing @ torch.clamp(z, on.low, on.high)
         values = _reflectance(torch, rows.logs(scores, offset)).T
         albedo = _reflectance(torch, on.checked.logs(scores, offset)) @ on.check
         tied = _tied(albedo)
@@ -428,7 +536,7 @@ class BRDFEmbedding:
                     tensor(self._check),
                     tensor(self.low_),
                     tensor(self.high_),
-                    tensor(_OPPONENT),
+                    tensor(self._mixing),
                 )
         return self._tensors[key]
 
@@ -461,7 +569,7 @@ class BRDFEmbedding:
         self, z: ArrayLike, offset: Float32 | None, cells: ArrayLike | None = None
     ) -> tuple[Float32, float]:
         """f (n, 3) before its energy is checked, and its greatest directional albedo."""
-        scores = _channel_scores(_OPPONENT, self.clip(z)).astype(np.float32)
+        scores = (self._mixing @ self.clip(z)).astype(np.float32)
         self._check_offset(offset)
         logs = self._rows(cells).logs(scores, offset)
         values: Float32 = np.ascontiguousarray(_reflectance(np, logs, out=logs).T)
@@ -482,7 +590,7 @@ class BRDFEmbedding:
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        scores = _channel_scores(_OPPONENT, self.clip(self.encode(table))).astype(np.float32)
+        scores = (self._mixing @ self.clip(self.encode(table))).astype(np.float32)
         decoded = self._every.logs(scores, None).T
         return np.asarray(_log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
@@ -497,7 +605,7 @@ class BRDFEmbedding:
         h, d = np.degrees(th), np.degrees(td)
         body = ((h > 35.0) & (h < 50.0) & (d > 2.0) & (d < 25.0)).ravel()
         row = self.components_[body].mean(axis=0).astype(np.float64)
-        return np.kron(np.eye(3), row)
+        return np.asarray(_OPPONENT @ (row @ self._mixing), np.float64)
 
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
         """The table at coordinates `z` (k,), on the embedding's grid or any other."""
@@ -510,6 +618,7 @@ class BRDFEmbedding:
         self._fitted()
         return {
             "grid": np.array(self.grid_.shape),
+            "n_components": np.array(self.n_components),
             "mean": self.mean_,
             "components": self.components_.astype(np.float16),
             "low": self.low_,
@@ -521,7 +630,8 @@ class BRDFEmbedding:
     def from_arrays(cls, state: dict[str, NDArray[Any]]) -> BRDFEmbedding:
         """The inverse of `arrays`."""
         components = state["components"].astype(np.float32)
-        result = cls(int(components.shape[1]))
+        achromatic, chromatic = (int(n) for n in state["n_components"])
+        result = cls((achromatic, chromatic))
         n_h, n_d, n_p = (int(n) for n in state["grid"])
         result.grid_ = HalfDiffGrid(n_h, n_d, n_p, "folded")
         result.weight_ = _cell_weight(result.grid_)
@@ -539,9 +649,44 @@ def _log_map(values: NDArray[Any]) -> Float32:
     return logs
 
 
-def _channel_scores(opponent: Any, z: Any) -> Any:
-    """(3 m,) coordinates to (3, m) channel scores; arrays or tensors."""
-    return opponent.T @ z.reshape(3, -1)
+def _mixing(n_components: tuple[int, int]) -> Float64:
+    """(3, m, k): what a coordinate gives to each channel's scores on the m components."""
+    achromatic, chromatic = n_components
+    result = np.zeros((3, achromatic + chromatic, achromatic + 2 * chromatic))
+    grey, red_blue, green = _OPPONENT
+    result[:, :achromatic, :achromatic] = grey[:, None, None] * np.eye(achromatic)
+    middle = achromatic + chromatic
+    result[:, achromatic:, achromatic:middle] = red_blue[:, None, None] * np.eye(chromatic)
+    result[:, achromatic:, middle:] = green[:, None, None] * np.eye(chromatic)
+    return result
+
+
+def _checked_grid(tables: Iterable[TabulatedBRDF]) -> tuple[HalfDiffGrid, int]:
+    """The grid of tables that can be fitted to, and their number."""
+    grid, count = None, 0
+    for table in tables:
+        if grid is None:
+            grid = table.grid
+        elif table.grid != grid:
+            raise ValueError("tables: expected all on one grid, got several")
+        count += 1
+    if grid is None or count < 2:
+        raise ValueError(f"tables: expected at least two, got {count}")
+    if grid.layout != "folded":
+        raise ValueError(f"tables: expected the 'folded' layout, got {grid.layout!r}")
+    return grid, count
+
+
+def _batches(tables: Iterable[TabulatedBRDF]) -> Iterator[Float32]:
+    """log(f + FLOOR) (n, 3, cells) of some tables at a time."""
+    waiting: list[Float32] = []
+    for table in tables:
+        waiting.append(_log_map(table.values).reshape(-1, 3).T)
+        if len(waiting) == _BATCH:
+            yield np.stack(waiting)
+            waiting.clear()
+    if waiting:
+        yield np.stack(waiting)
 
 
 def _reflectance(xp: Any, logs: Any, out: Any = None) -> Any:
