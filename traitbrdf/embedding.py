@@ -78,13 +78,21 @@ class _Rows(NamedTuple):
 
     def logs(self, scores: Any, offset: Any) -> Any:
         """log(f + FLOOR) (3, n) of channel scores (3, m), with an offset (cells, 3) or None."""
-        logs = scores @ self.basis
+        logs = _product(scores, self.basis)
         logs += self.mean
         if offset is not None:
             whole = isinstance(self.index, slice) or isinstance(offset, torch.Tensor)
             # numpy's take of rows is ten times as fast as its indexing
             logs += (offset[self.index] if whole else offset.take(self.index, axis=0)).T
         return logs
+
+
+def _product(a: Any, b: Any) -> Any:
+    """a @ b of arrays or tensors, by torch: numpy's threads spin for milliseconds after a product,
+    and those of the next one, which is torch's, wait for the same cores."""
+    if isinstance(a, torch.Tensor):
+        return a @ b
+    return torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
 
 
 class _Tensors(NamedTuple):
@@ -139,7 +147,7 @@ class BRDFEmbedding:
         Parameters
         ----------
         tables : iterable of TabulatedBRDF
-            Anything but an iterator may be larger than memory: it is gone through four times, and
+            Anything but an iterator may be larger than memory: it is gone through seven times, and
             128 tables are held at once.
 
         Raises
@@ -149,6 +157,7 @@ class BRDFEmbedding:
         """
         if isinstance(tables, Iterator):
             tables = list(tables)
+        self.__dict__.pop("components_", None)  # a fit that fails leaves none
         self.grid_, count = _checked_grid(tables)
         achromatic, chromatic = self.n_components
         if count <= max(achromatic, chromatic):
@@ -580,7 +589,7 @@ class BRDFEmbedding:
     def _check_albedos(self, scores: Float32, offset: Float32 | None) -> Float32:
         """Directional albedos (3, 16) of channel scores (3, m), before the energy scaling."""
         logs = self._checked.logs(scores, offset)
-        albedo: Float32 = _reflectance(np, logs, out=logs) @ self._check
+        albedo: Float32 = _product(_reflectance(np, logs, out=logs), self._check)
         return albedo
 
     def residual(self, brdf: TabulatedBRDF) -> Float32:
