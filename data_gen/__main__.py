@@ -1,4 +1,4 @@
-"""``python -m data_gen``: rebuild the artifact that the package ships, from the recipe."""
+"""``python -m data_gen``: rebuild the artifact that the package ships, or study embeddings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from data_gen.packing import COMPONENTS, COUNT, SEED, build
+from data_gen.study import CANDIDATES, study, table
 from data_gen.tables import Tables
 from traitbrdf.embedding import GRID
 from traitbrdf.formats import write_arrays
@@ -17,6 +18,14 @@ _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "libr
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen", description=__doc__)
+    parser.add_argument(
+        "what", nargs="?", choices=("build", "study"), default="build",
+        help="build the artifact, or compare embeddings on measured materials (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--data", type=Path, default=Path("../shared/data"),
+        help="for study: folder of measured materials; held-out members alone without it",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, default=_SHIPPED, help="file to write (%(default)s)")
     parser.add_argument("--count", type=int, default=COUNT, help="materials (%(default)s)")
     parser.add_argument("--seed", type=int, default=SEED, help="seed (%(default)s)")
@@ -48,6 +57,16 @@ def main(arguments: list[str] | None = None) -> int:
             end = "\n" if fraction >= 1.0 else "\r"
             print(f"{stage}: {100 * fraction:3.0f} %", end=end, file=sys.stderr, flush=True)
 
+    if given.what == "study":
+        data = given.data if (given.data / "merl_slices").is_dir() else None
+        try:
+            print(table(list(study(CANDIDATES, given.count, data, given.seed, progress))))
+        except KeyboardInterrupt:
+            return 1
+        except ValueError as error:
+            print(f"data_gen: {error}", file=sys.stderr)
+            return 1
+        return 0
     try:
         if not given.out.parent.is_dir():  # rather than after the work
             raise FileNotFoundError(f"{given.out}: expected an existing folder")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_gen import __main__ as command
-from data_gen import packing, tables
+from data_gen import packing, study, tables
 from data_gen.families import FAMILIES, materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.packing import build
@@ -287,3 +287,48 @@ def test_wrong_usage_and_help(capsys):
         command.main(["--help"])
     assert asked.value.code == 0
     assert "--count" in capsys.readouterr().out
+
+
+# -- the study --------------------------------------------------------------------------------
+
+
+def test_candidates_are_told_apart():
+    """Held-out members alone: more numbers err less, and every kind of candidate runs."""
+    few, more = (study.Candidate(components=c, grid=COARSE) for c in ((2, 1), (8, 4)))
+    others = [
+        study.Candidate("cube root", "channel", (4,), "even", COARSE),
+        study.Candidate("log-relative", "together", (12,), grid=COARSE),
+        study.Candidate("log1p twice", components=(4, 2), grid=COARSE),
+    ]
+    told = []
+    rows = list(
+        study.study([few, more, *others], 102, None, progress=lambda *news: told.append(news))
+    )
+    errors = [result["held out"] for _, result in rows]
+    assert errors[1] < 0.7 * errors[0]
+    assert all(0.0 < e < 1.0 for e in errors)
+    assert [c.numbers for c, _ in rows] == [4, 16, 12, 12, 8]
+    assert told[-1] == ("comparing", 1.0)
+    lines = study.table(rows).splitlines()
+    assert len(lines) == 7
+    assert f"| 8+4 | 16 | cosine | 45x12x5 | {errors[1]:.3f} |" in lines[3]
+
+
+def test_mappings_go_there_and_back():
+    f = np.array([[0.0, 1e-4, 0.02, 1.0, 30.0]])
+    w, b = np.linspace(0.2, 1.0, 5), np.linspace(0.01, 1.0, 5)
+    for forward, back in study._MAPPINGS.values():
+        np.testing.assert_allclose(back(forward(f, w, b), w, b), f, rtol=1e-9, atol=1e-12)
+
+
+def test_spaces_hold_what_they_were_fitted_to():
+    """Materials of as many shapes as a space has numbers come back."""
+    models = [Lambert((0.2, 0.4, 0.3)), GGX(0.2, 1.5, 0.0), GGX(0.5, (0.2, 0.9, 1.5), 3.0)]
+    tables = [TabulatedBRDF.from_model(m, COARSE).values.reshape(-1, 3).T for m in models]
+    known = np.stack(tables).astype(np.float32)
+    seen = COARSE.above_horizon.ravel()
+    angles = tuple(a.ravel()[seen] for a in COARSE.node_angles())
+    one = study.Set("own", angles, {"ggx": known[2][:, seen].astype(np.float64)})
+    space = study.Space(study.Candidate(colour="together", components=(2,), grid=COARSE), known)
+    (error,) = space.errors(one)
+    assert np.median(error) < 0.02

@@ -1,0 +1,273 @@
+"""Which embedding reaches real materials: mappings, weights, colour and dimensions compared.
+
+Every candidate is a linear space of mapped tables, fitted to the same library; measured materials
+that the library knows nothing of are encoded into it by the same robust fit, and judged by the same
+error, median |d log(f + 1e-3)| within 75 degrees of the normal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils.extmath import randomized_svd
+
+from data_gen.families import materials
+from data_gen.tables import Progress, table_of
+from traitbrdf.brdf import HalfDiffGrid
+from traitbrdf.directions import from_half_diff_angles
+from traitbrdf.embedding import FLOOR, GRID
+from traitbrdf.measured import MeasuredBRDF
+
+Float64: TypeAlias = NDArray[np.float64]
+Float32: TypeAlias = NDArray[np.float32]
+
+TRUSTED = math.radians(75.0)
+HELD_OUT = 17
+"""Every so many-th member of the library is encoded, not fitted to."""
+
+_TURN = np.array(
+    [
+        [1.0, 1.0, 1.0] / np.sqrt(3.0),
+        [1.0, 0.0, -1.0] / np.sqrt(2.0),
+        [-1.0, 2.0, -1.0] / np.sqrt(6.0),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Set:
+    """Materials by name, each (3, n) in 1/sr at the same angles, each (n,) in radians."""
+
+    name: str
+    angles: tuple[Float64, Float64, Float64]
+    materials: dict[str, Float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An embedding to be compared.
+
+    Parameters
+    ----------
+    mapping : "log", "log-relative", "cube root" or "log1p twice"
+    colour : "apart" (mean of the channels and two differences), "channel" (one basis for each), or
+        "together" (one vector of all three)
+    components : of each; two numbers if apart
+    weight : "cosine" (square root of the lower one) or "even", of the cells above the horizon
+    grid : HalfDiffGrid
+    """
+
+    mapping: str = "log"
+    colour: str = "apart"
+    components: tuple[int, ...] = (14, 5)
+    weight: str = "cosine"
+    grid: HalfDiffGrid = GRID
+
+    @property
+    def numbers(self) -> int:
+        """k, of one material."""
+        if self.colour == "apart":
+            return self.components[0] + 2 * self.components[1]
+        return self.components[0] * (3 if self.colour == "channel" else 1)
+
+
+CANDIDATES: tuple[Candidate, ...] = (
+    Candidate(),
+    Candidate(components=(12, 6)),
+    Candidate(components=(16, 4)),
+    Candidate(colour="channel", components=(8,)),
+    Candidate(colour="together", components=(24,)),
+    Candidate(weight="even"),
+    Candidate("log-relative"),
+    Candidate("cube root"),
+    Candidate("log1p twice"),
+    Candidate(grid=HalfDiffGrid(60, 16, 7)),
+    *(Candidate(components=(m, n)) for m, n in ((2, 1), (4, 2), (6, 3), (8, 4), (20, 8))),
+    *(Candidate("log-relative", "channel", (m,)) for m in (1, 2, 3, 5, 8, 12)),
+)
+"""The default first; last, errors against k beside plain log-relative PCA (Nielsen et al. 2015)."""
+
+
+_Map: TypeAlias = Callable[[Any, Any, Any], Any]
+
+_MAPPINGS: dict[str, tuple[_Map, _Map]] = {
+    "log": (lambda f, w, b: np.log(f + FLOOR), lambda y, w, b: np.exp(y) - FLOOR),
+    # Nielsen et al. 2015, equation 1: w is the cosine, b = median w + FLOOR
+    "log-relative": (
+        lambda f, w, b: np.log((f * w + FLOOR) / b),
+        lambda y, w, b: (np.exp(y) * b - FLOOR) / w,
+    ),
+    "cube root": (lambda f, w, b: np.cbrt(f), lambda y, w, b: y**3),
+    "log1p twice": (
+        lambda f, w, b: np.log1p(np.log1p(f)),
+        lambda y, w, b: np.expm1(np.expm1(np.clip(y, 0.0, 3.3))),
+    ),
+}
+"""y of f, and f of y; w and b are of the cell."""
+
+
+class Space:
+    """A candidate, fitted to tables (n, 3, cells) of f."""
+
+    def __init__(self, candidate: Candidate, tables: Float32) -> None:
+        self.grid = candidate.grid
+        self._forward, self._back = _MAPPINGS[candidate.mapping]
+        th, td, pd = self.grid.node_angles()
+        lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
+        cosine = np.maximum(lower, 0.0).ravel()
+        weight = np.sqrt(cosine) if candidate.weight == "cosine" else (cosine > 0.0) * 1.0
+        self._w = np.maximum(cosine, 1e-3)
+        self._b = np.median(tables.reshape(-1, self.grid.size), axis=0) * self._w + FLOOR
+        mapped = self._forward(tables, self._w, self._b).astype(np.float32)
+        mean = mapped.mean(axis=(0, 1))
+        mapped -= mean
+        self._mean = np.repeat(mean[None].astype(np.float64), 3, axis=0)
+        size = self.grid.size
+        if candidate.colour == "together":
+            self._mean += mapped.mean(axis=0)
+            rows = (mapped - mapped.mean(axis=0)).reshape(len(mapped), -1)
+            basis = _loadings(rows, np.tile(weight, 3), candidate.components[0])
+            self._design = basis.reshape(-1, 3, size)
+        elif candidate.colour == "channel":
+            basis = _loadings(mapped.reshape(-1, size), weight, candidate.components[0])
+            self._design = np.einsum("dc,bx->dbcx", np.eye(3), basis).reshape(-1, 3, size)
+        else:
+            turned = np.einsum("ac,ncx->nax", _TURN, mapped)
+            grey = _loadings(turned[:, 0], weight, candidate.components[0])
+            colour = _loadings(turned[:, 1:].reshape(-1, size), weight, candidate.components[1])
+            parts = zip(_TURN, (grey, colour, colour), strict=True)
+            self._design = np.concatenate([t[None, :, None] * b[:, None] for t, b in parts])
+
+    def errors(self, known: Set) -> list[Float64]:
+        """|d log(f + FLOOR)| (3, n) of every material of a set, encoded and decoded again."""
+        index, corner = self.grid.stencil(*known.angles)
+
+        def at(cells: Float64) -> Float64:
+            return np.asarray(np.einsum("nk,...nk->...n", corner, cells[..., index]))
+
+        design, mean, w, b = (at(v) for v in (self._design, self._mean, self._w, self._b))
+        found = []
+        for values in known.materials.values():
+            target = self._forward(values, w, b) - mean
+            z = _robust(design.reshape(len(design), -1), target.ravel())
+            shown = self._back(np.tensordot(z, design, 1) + mean, w, b)
+            found.append(np.abs(np.log(np.maximum(shown, 0.0) + FLOOR) - np.log(values + FLOOR)))
+        return found
+
+
+def _loadings(rows: Any, weight: Float64, count: int) -> Float64:
+    """Components (count, cells) of rows (n, cells), for scores of unit variance."""
+    left, _, _ = randomized_svd(rows * weight.astype(np.float32), count, random_state=0)
+    scores = left * math.sqrt(len(rows))
+    return np.asarray(np.linalg.solve(scores.T @ scores, scores.T @ rows), np.float64)
+
+
+def _robust(design: Float64, target: Float64) -> Float64:
+    """Coordinates with nearly the least sum of absolute deviations, under a weak prior."""
+    weight, prior = np.ones(len(target)), 1e-5 * len(target) * np.eye(len(design))
+    scale = 0.03 * max(float(np.std(target)), 1e-6)
+    z: Float64 = np.zeros(len(design))
+    for _ in range(15):
+        weighted = design * weight
+        z = np.asarray(np.linalg.solve(weighted @ design.T + prior, weighted @ target), np.float64)
+        weight = scale / np.maximum(np.abs(target - z @ design), scale)
+    return z
+
+
+# -- what is judged -------------------------------------------------------------------------------
+
+
+def measured(data: Path) -> list[Set]:
+    """The measured materials of a folder: MERL slices, and RGL materials of all angles."""
+    with np.load(data / "merl_slices" / "merl_phi_d_90.npz") as file:
+        names, values = file["names"], np.maximum(file["values"].astype(np.float64), 0.0)
+    h, d = np.meshgrid(
+        (np.arange(90) / 90) ** 2 * math.pi / 2, np.radians(np.arange(90)), indexing="ij"
+    )
+    trusted = np.cos(h) * np.cos(d) > math.cos(TRUSTED)
+    angles = h[trusted], d[trusted], np.full(trusted.sum(), math.pi / 2)
+    slices = {str(n): v[trusted].T for n, v in zip(names, values, strict=True)}
+    axes = (
+        (np.arange(90) / 90) ** 2 * math.pi / 2,
+        (np.arange(16) + 0.5) / 16 * math.pi / 2,
+        (np.arange(6) + 0.5) / 6 * math.pi / 2,
+    )
+    th, td, pd = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    wi, wo = from_half_diff_angles(th, td, pd)
+    trusted = np.minimum(wi[:, 2], wo[:, 2]) > math.cos(TRUSTED)
+    wi, wo = wi[trusted], wo[trusted]
+    whole = {
+        path.stem: np.maximum(MeasuredBRDF.read(path).eval(wi, wo), 0.0).T
+        for path in sorted((data / "rgl").glob("*.bsdf"))
+    }
+    return [Set("MERL", angles, slices), Set("RGL", (th[trusted], td[trusted], pd[trusted]), whole)]
+
+
+def members(count: int, seed: int, grid: HalfDiffGrid) -> tuple[list[str], Float32]:
+    """Names and tables (count, 3, cells) of the recipe's first members."""
+    found = list(materials(seed, count))
+    tables = [table_of(m, grid).values.reshape(-1, 3).T for m in found]
+    return [m.name for m in found], np.stack(tables).astype(np.float32)
+
+
+def study(
+    candidates: Sequence[Candidate],
+    count: int,
+    data: Path | None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Iterator[tuple[Candidate, dict[str, float]]]:
+    """Each candidate with its errors: medians over materials of the median over their cells.
+
+    Yields
+    ------
+    candidate, and "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL":
+    those for which there is data
+    """
+    report = progress or (lambda stage, fraction: None)
+    sets = [] if data is None else measured(data)
+    tables: dict[HalfDiffGrid, tuple[list[str], Float32]] = {}
+    for done, candidate in enumerate(candidates):
+        grid = candidate.grid
+        if grid not in tables:
+            tables = {grid: members(count, seed, grid)}
+        names, known = tables[grid]
+        held = np.arange(count) % HELD_OUT == HELD_OUT - 1
+        space = Space(candidate, known[~held])
+        th, td, pd = (a[grid.above_horizon] for a in grid.node_angles())
+        seen = grid.above_horizon.ravel()
+        apart = {names[i]: known[i][:, seen].astype(np.float64) for i in np.flatnonzero(held)[:60]}
+        result = {}
+        for one in [Set("held out", (th, td, pd), apart), *sets]:
+            errors = space.errors(one)
+            medians = [float(np.median(e)) for e in errors]
+            result[one.name] = float(np.median(medians))
+            if one.name == "MERL":
+                peak = one.angles[0] < math.radians(10.0)
+                result["MERL, 90th"] = float(np.quantile(medians, 0.9))
+                result["MERL, peak"] = float(np.median([np.median(e[:, peak]) for e in errors]))
+        report("comparing", (done + 1) / len(candidates))
+        yield candidate, result
+
+
+def table(rows: Sequence[tuple[Candidate, dict[str, float]]]) -> str:
+    """The comparison as a Markdown table."""
+    names = list(rows[0][1])
+    lines = [
+        "| mapping | colour | components | k | weight | grid | " + " | ".join(names) + " |",
+        "|" + "---|" * (6 + len(names)),
+    ]
+    for candidate, result in rows:
+        parts = (
+            candidate.mapping, candidate.colour, "+".join(map(str, candidate.components)),
+            str(candidate.numbers), candidate.weight, "x".join(map(str, candidate.grid.shape)),
+            *(f"{result[name]:.3f}" for name in names),
+        )  # fmt: skip
+        lines.append("| " + " | ".join(parts) + " |")
+    return "\n".join(lines)
