@@ -364,7 +364,8 @@ def test_gradients_are_products_with_the_slopes(seed, spread, with_offset):
     slopes = EMBEDDING.jacobian(z, offset, cells)
     terms = np.abs(back[..., None] * slopes).sum(axis=(0, 1))
     error = np.abs(point.grad.numpy() - np.einsum("nc,nck->k", back, slopes))
-    assert np.all(error <= 2e-5 * terms.max())
+    # slopes are float32, of logarithms that are sums of terms of some hundred
+    assert np.all(error <= 1e-4 * terms.max())
     outside = z != EMBEDDING.clip(z)
     assert not point.grad.numpy()[outside].any()
     assert not slopes[..., outside].any()
