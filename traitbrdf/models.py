@@ -194,6 +194,16 @@ class Model:
     __rmul__ = __mul__
 
 
+class _Lobe(Model):
+    """A lobe whose albedo is at most its weight `k_s`."""
+
+    k_s: RGBLike
+
+    @property
+    def albedo_bound(self) -> Float64:
+        return np.array(self.k_s, np.float64)
+
+
 def _parts(model: Model) -> tuple[Model, ...]:
     return model.parts if isinstance(model, Sum) else (model,)
 
@@ -328,7 +338,7 @@ class OrenNayar(Model):
 
 
 @dataclass(frozen=True)
-class PerfectMirror(Model):
+class PerfectMirror(_Lobe):
     """A perfect mirror of weight k_s: a delta term, in `mirror` alone.
 
     Parameters
@@ -346,10 +356,6 @@ class PerfectMirror(Model):
 
     @property
     def mirror(self) -> Float64:
-        return np.array(self.k_s, np.float64)
-
-    @property
-    def albedo_bound(self) -> Float64:
         return np.array(self.k_s, np.float64)
 
 
@@ -397,7 +403,7 @@ class NormalizedPhong(Model):
 
 
 @dataclass(frozen=True)
-class BoundedPhong(Model):
+class BoundedPhong(_Lobe):
     """Reciprocal, energy-bounded Phong lobe.
 
     f = k_s (1 + s)/(2 pi) max(0, wo.m)^s / max(c_i, c_o): the lobe of `NormalizedPhong` with the
@@ -421,10 +427,6 @@ class BoundedPhong(Model):
         pair = _Pair(wi, wo)
         lobe = (1.0 + self.s) / (2.0 * math.pi) * pair.cos_mirror**self.s
         return pair.result(lobe / pair.max_cos, self.k_s)
-
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
 
 
 def _gaussian(theta_h: Float64, s: float) -> Float64:
@@ -462,7 +464,7 @@ class TorranceSparrowSimplified(Model):
 
 
 @dataclass(frozen=True)
-class BoundedTorranceSparrow(Model):
+class BoundedTorranceSparrow(_Lobe):
     """Energy-bounded Gaussian lobe in theta_h.
 
     f = k_s S / (4 c_d max(c_i, c_o)) with the S of `TorranceSparrowSimplified`, whose value it
@@ -487,10 +489,6 @@ class BoundedTorranceSparrow(Model):
         return pair.result(
             _gaussian(pair.theta_h, self.s) / (4.0 * pair.cos_d * pair.max_cos), self.k_s
         )
-
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
 
 
 @dataclass(frozen=True)
@@ -549,10 +547,10 @@ _LOBE = (
     _colour("k_s", 0.5, "specular weight"),
     _colour("r0", 1.0, "reflectance at normal incidence; 1 for no Fresnel effect"),
 )
-_WIDTH = Parameter("alpha", 1e-4, 1.0, 0.1, "roughness", log=True)
+_ALPHA = Parameter("alpha", 1e-4, 1.0, 0.1, "roughness", log=True)
 
 
-class _HalfVectorLobe(Model):
+class _HalfVectorLobe(_Lobe):
     """f = k_s F(c_d) P(theta_h) / (4 c_d max(c_i, c_o)), F(c) = r0 + (1 - r0)(1 - c)^5.
 
     The frame of Ashikhmin & Shirley, "An Anisotropic Phong BRDF Model" (2000), equation 4, for any
@@ -560,7 +558,6 @@ class _HalfVectorLobe(Model):
     quadrature. The albedo is at most k_s, as that of `BoundedTorranceSparrow`.
     """
 
-    k_s: RGBLike
     r0: RGBLike
 
     def _shape(self, sin2: Float64) -> Float64:
@@ -580,10 +577,6 @@ class _HalfVectorLobe(Model):
         lobe = self._shape(pair.sin2_h) / (4.0 * self._norm * pair.cos_d * pair.max_cos)
         fresnel = _schlick(pair.cos_d, np.array(self.r0, np.float64))
         return pair.result(lobe, fresnel * np.array(self.k_s))
-
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
 
 
 def _tan2(sin2: Float64) -> Float64:
@@ -639,7 +632,7 @@ class Beckmann(_HalfVectorLobe):
     r0: RGBLike = 1.0
     alpha: float = 0.1
 
-    parameters = (*_LOBE, _WIDTH)
+    parameters = (*_LOBE, _ALPHA)
 
     def _shape(self, sin2: Float64) -> Float64:
         return _gaussian_slopes(_tan2(sin2), self.alpha**2)
@@ -668,7 +661,7 @@ class GTR(_HalfVectorLobe):
     alpha: float = 0.1
     gamma: float = 1.5
 
-    parameters = (*_LOBE, _WIDTH, Parameter("gamma", 0.5, 10.0, 1.5, "fall-off of the tails"))
+    parameters = (*_LOBE, _ALPHA, Parameter("gamma", 0.5, 10.0, 1.5, "fall-off of the tails"))
 
     def _shape(self, sin2: Float64) -> Float64:
         return np.asarray((1.0 - sin2 + sin2 / self.alpha**2) ** -self.gamma)
@@ -732,7 +725,7 @@ class ShiftedGamma(_HalfVectorLobe):
     alpha: float = 0.1
     p: float = 1.0
 
-    parameters = (*_LOBE, _WIDTH, Parameter("p", 0.0, 3.0, 1.0, "fall-off between peak and base"))
+    parameters = (*_LOBE, _ALPHA, Parameter("p", 0.0, 3.0, 1.0, "fall-off between peak and base"))
 
     def _shape(self, sin2: Float64) -> Float64:
         tan2 = _tan2(sin2)
@@ -741,7 +734,7 @@ class ShiftedGamma(_HalfVectorLobe):
 
 
 @dataclass(frozen=True)
-class Ward(Model):
+class Ward(_Lobe):
     """Ward's Gaussian lobe with a bounded albedo.
 
     f = k_s exp(-tan^2(theta_h)/alpha^2) / (4 pi alpha^2 c_d^2 cos^4(theta_h)): the isotropic case
@@ -759,7 +752,7 @@ class Ward(Model):
     k_s: RGBLike = 0.5
     alpha: float = 0.1
 
-    parameters = (_colour("k_s", 0.5, "specular weight"), _WIDTH)
+    parameters = (_colour("k_s", 0.5, "specular weight"), _ALPHA)
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Float64:
         pair = _Pair(wi, wo)
@@ -767,13 +760,9 @@ class Ward(Model):
         lobe = _gaussian_slopes(_tan2(pair.sin2_h), a2) / (4.0 * math.pi * a2 * pair.cos_d**2)
         return pair.result(lobe, self.k_s)
 
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
-
 
 @dataclass(frozen=True)
-class RetroReflection(Model):
+class RetroReflection(_Lobe):
     """Light thrown back to where it came from, as by glass beads or rough velvet.
 
     f = k_s (n + 1)/(2 pi) max(0, wi.wo)^n / max(c_i, c_o): `BoundedPhong` about the other direction
@@ -802,10 +791,6 @@ class RetroReflection(Model):
         lobe = (self.n + 1.0) / (2.0 * math.pi) * cos**self.n / pair.max_cos
         return pair.result(lobe, self.k_s)
 
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
-
 
 # ---------------------------------------------------------------------------------------------
 # Microfacet models
@@ -813,7 +798,6 @@ class RetroReflection(Model):
 _WAVELENGTHS = np.array([650.0, 550.0, 450.0])
 """Where the three colours of a spectrum are looked at, nm."""
 
-_ALPHA = Parameter("alpha", 1e-4, 1.0, 0.1, "roughness", log=True)
 _COAT_ETA = Parameter("eta", 1.0, 3.0, 1.5, "index of refraction of the coat")
 
 
@@ -840,7 +824,7 @@ def _ggx_lobe(pair: _Pair, alpha: float) -> Float64:
 
 
 @dataclass(frozen=True)
-class GGX(Model):
+class GGX(_Lobe):
     """GGX microfacets with exact Fresnel: a conductor, or the surface of a dielectric (k = 0).
 
     f = k_s D F(c_d) G_2 / (4 c_i c_o), D as in `ggx_distribution`, F as in `fresnel_conductor`
@@ -883,13 +867,9 @@ class GGX(Model):
         f = fresnel_conductor(cos, eta, k) if k.any() else fresnel_dielectric(cos, eta)
         return pair.result(_ggx_lobe(pair, self.alpha), f * np.array(self.k_s))
 
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
-
 
 @dataclass(frozen=True)
-class Interference(Model):
+class Interference(_Lobe):
     """Flakes under a thin film: their colour turns with the angle.
 
     f = D G_2 / (4 c_i c_o) k_s (1 + v cos(4 pi eta d c_t / lambda)) / (1 + v), D and G_2 those of
@@ -932,13 +912,9 @@ class Interference(Model):
         fringes = (1.0 + self.v * np.cos(phase)) / (1.0 + self.v)
         return pair.result(_ggx_lobe(pair, self.alpha), fringes * np.array(self.k_s))
 
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
-
 
 @dataclass(frozen=True)
-class Sheen(Model):
+class Sheen(_Lobe):
     """Light scattered by fibres that stand off the surface: the bright rim of cloth.
 
     f = k_s D / (4 (c_i + c_o - c_i c_o)), D = (2 + 1/alpha) sin(theta_h)^(1/alpha) / (2 pi).
@@ -967,10 +943,6 @@ class Sheen(Model):
         d = (2.0 + inverse) / (2.0 * math.pi) * pair.sin2_h ** (0.5 * inverse)
         ci, co = pair.cos_i, pair.cos_o
         return pair.result(d / (4.0 * (ci + co - ci * co)), self.k_s)
-
-    @property
-    def albedo_bound(self) -> Float64:
-        return np.array(self.k_s, np.float64)
 
 
 # ---------------------------------------------------------------------------------------------
