@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen.families import materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.tables import Progress, Tables
 from traitbrdf.embedding import GRID, BRDFEmbedding
@@ -32,7 +31,7 @@ def build(
 
     Parameters
     ----------
-    count, seed : as for `materials`
+    count, seed : as for `data_gen.families.materials`
     components : as for `BRDFEmbedding`
     progress : called with (stage, fraction); may raise to stop
     folder : where tables are kept while they are needed, and after an interruption: 0.24 MB a
@@ -61,17 +60,16 @@ def build(
     embedding.low_ = coordinates.min(axis=0).astype(np.float64)
     embedding.high_ = coordinates.max(axis=0).astype(np.float64)
     report("embedding", 1.0)
-    families = [material.family for material in materials(seed, count)]
     marks = {name: labels(values) for name, values in trait_values(rows).items()}
     space = TraitSpace.fit(
-        coordinates, marks, embedding.low_, embedding.high_, families, embedding.body_rows()
+        coordinates, marks, embedding.low_, embedding.high_, tables.families, embedding.body_rows()
     )
     report("traits", 1.0)
     return {
         **embedding.arrays(),
         **space.arrays(),
         "names": np.array(tables.names),
-        "families": np.array(families),
+        "families": np.array(tables.families),
         "coordinates": coordinates,
         "labels": np.stack([marks[name] for name in space.names]),
     }

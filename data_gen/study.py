@@ -21,7 +21,7 @@ from data_gen.families import materials
 from data_gen.tables import Progress, table_of
 from traitbrdf.brdf import HalfDiffGrid
 from traitbrdf.directions import from_half_diff_angles
-from traitbrdf.embedding import FLOOR, GRID
+from traitbrdf.embedding import FLOOR, GRID, OPPONENT
 from traitbrdf.measured import MeasuredBRDF
 
 Float64: TypeAlias = NDArray[np.float64]
@@ -30,14 +30,6 @@ Float32: TypeAlias = NDArray[np.float32]
 TRUSTED = math.radians(75.0)
 HELD_OUT = 17
 """Every so many-th member of the library is encoded, not fitted to."""
-
-_TURN = np.array(
-    [
-        [1.0, 1.0, 1.0] / np.sqrt(3.0),
-        [1.0, 0.0, -1.0] / np.sqrt(2.0),
-        [-1.0, 2.0, -1.0] / np.sqrt(6.0),
-    ]
-)
 
 
 @dataclass(frozen=True)
@@ -118,11 +110,9 @@ class Space:
     def __init__(self, candidate: Candidate, tables: Float32) -> None:
         self.grid = candidate.grid
         self._forward, self._back = _MAPPINGS[candidate.mapping]
-        th, td, pd = self.grid.node_angles()
-        lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
-        cosine = np.maximum(lower, 0.0).ravel()
-        weight = np.sqrt(cosine) if candidate.weight == "cosine" else (cosine > 0.0) * 1.0
-        self._w = np.maximum(cosine, 1e-3)
+        cosine: Float64 = np.maximum(self.grid.lower_cosine, 0.0).ravel()
+        weight = cosine**0.5 if candidate.weight == "cosine" else np.where(cosine > 0.0, 1.0, 0.0)
+        self._w: Float64 = np.maximum(cosine, 1e-3)
         self._b = np.median(tables.reshape(-1, self.grid.size), axis=0) * self._w + FLOOR
         mapped = self._forward(tables, self._w, self._b).astype(np.float32)
         mean = mapped.mean(axis=(0, 1))
@@ -138,10 +128,10 @@ class Space:
             basis = _loadings(mapped.reshape(-1, size), weight, candidate.components[0])
             self._design = np.einsum("dc,bx->dbcx", np.eye(3), basis).reshape(-1, 3, size)
         else:
-            turned = np.einsum("ac,ncx->nax", _TURN, mapped)
+            turned = np.einsum("ac,ncx->nax", OPPONENT, mapped)
             grey = _loadings(turned[:, 0], weight, candidate.components[0])
             colour = _loadings(turned[:, 1:].reshape(-1, size), weight, candidate.components[1])
-            parts = zip(_TURN, (grey, colour, colour), strict=True)
+            parts = zip(OPPONENT, (grey, colour, colour), strict=True)
             self._design = np.concatenate([t[None, :, None] * b[:, None] for t, b in parts])
 
     def errors(self, known: Set) -> list[Float64]:

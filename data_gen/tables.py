@@ -57,7 +57,8 @@ class Tables:
     """
 
     def __init__(self, folder: Path, count: int, seed: int, grid: HalfDiffGrid) -> None:
-        self.names = [m.name for m in families.materials(seed, count)]  # bad numbers end here
+        known = list(families.materials(seed, count))  # bad numbers end here
+        self.names, self.families = [m.name for m in known], [m.family for m in known]
         self.count, self.seed, self.grid = count, seed, grid
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)

@@ -144,11 +144,16 @@ class HalfDiffGrid:
         return np.asarray(wi, np.float64), np.asarray(wo, np.float64)
 
     @cached_property
-    def above_horizon(self) -> NDArray[np.bool_]:
-        """Grid-shaped mask of the nodes with both directions above the horizon."""
+    def lower_cosine(self) -> Float64:
+        """Grid-shaped cosine of the lower one of a node's two directions; negative below."""
         th, td, pd = self.node_angles()
         lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
-        return np.asarray(lower > 1e-9)
+        return np.asarray(lower)
+
+    @cached_property
+    def above_horizon(self) -> NDArray[np.bool_]:
+        """Grid-shaped mask of the nodes with both directions above the horizon."""
+        return np.asarray(self.lower_cosine > 1e-9)
 
     def stencil(
         self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike

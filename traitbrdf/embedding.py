@@ -32,7 +32,7 @@ FLOOR = 1e-3
 GRID = HalfDiffGrid(90, 24, 9, "folded")
 """The grid on which the library lives and frames are decoded."""
 
-_OPPONENT = np.array(
+OPPONENT = np.array(
     [
         [1.0, 1.0, 1.0] / np.sqrt(3.0),
         [1.0, 0.0, -1.0] / np.sqrt(2.0),
@@ -193,7 +193,7 @@ class BRDFEmbedding:
 
         def rows() -> Iterator[Float32]:
             for logs in _batches(tables):
-                turned = np.einsum("ac,ncx->nax", _OPPONENT[axes].astype(np.float32), logs) - offset
+                turned = np.einsum("ac,ncx->nax", OPPONENT[axes].astype(np.float32), logs) - offset
                 yield turned.reshape(-1, logs.shape[2])
 
         signs = 1 if axes.start == 0 else 2
@@ -286,7 +286,7 @@ class BRDFEmbedding:
         else:
             table = TabulatedBRDF.from_model(brdf, self.grid_)
         logs = _log_map(table.values).reshape(-1, 3) - self.mean_[:, None]
-        grey, red_blue, green = (logs @ _OPPONENT.T).T
+        grey, red_blue, green = (logs @ OPPONENT.T).T
         achromatic, chromatic = self._project
         return np.concatenate([achromatic @ grey, chromatic @ red_blue, chromatic @ green])
 
@@ -614,7 +614,7 @@ class BRDFEmbedding:
         h, d = np.degrees(th), np.degrees(td)
         body = ((h > 35.0) & (h < 50.0) & (d > 2.0) & (d < 25.0)).ravel()
         row = self.components_[body].mean(axis=0).astype(np.float64)
-        return np.asarray(_OPPONENT @ (row @ self._mixing), np.float64)
+        return np.asarray(OPPONENT @ (row @ self._mixing), np.float64)
 
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
         """The table at coordinates `z` (k,), on the embedding's grid or any other."""
@@ -662,7 +662,7 @@ def _mixing(n_components: tuple[int, int]) -> Float64:
     """(3, m, k): what a coordinate gives to each channel's scores on the m components."""
     achromatic, chromatic = n_components
     result = np.zeros((3, achromatic + chromatic, achromatic + 2 * chromatic))
-    grey, red_blue, green = _OPPONENT
+    grey, red_blue, green = OPPONENT
     result[:, :achromatic, :achromatic] = grey[:, None, None] * np.eye(achromatic)
     middle = achromatic + chromatic
     result[:, achromatic:, achromatic:middle] = red_blue[:, None, None] * np.eye(chromatic)
@@ -716,9 +716,7 @@ def _tied(albedo: Any) -> Any:
 
 
 def _cell_weight(grid: HalfDiffGrid) -> Float32:
-    th, td, pd = grid.node_angles()
-    lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
-    return np.asarray(np.sqrt(np.maximum(lower, 0.0)).ravel(), np.float32)
+    return np.asarray(np.sqrt(np.maximum(grid.lower_cosine, 0.0)).ravel(), np.float32)
 
 
 class Library:

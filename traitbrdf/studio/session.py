@@ -193,10 +193,10 @@ class Session:
         edited = time.perf_counter()
         edit = self.edit
         ready = edit.ready
+        dragging, rest = header.get("dragging") is True, header.get("rest") is True
         draft_error = None
         if not ready:
             # a hand that turns the object wants to see it turn
-            dragging = header.get("dragging") is True
             image, draft_error = edit.draft(_TURNING if dragging else None)
         elif header.get("before") is True:
             image = edit.before()
@@ -205,8 +205,7 @@ class Session:
             # beside it, and whoever asks for it gets it exactly
             image = edit.render(exact=header.get("exact") is True)
         rendered = time.perf_counter()
-        whole = kind == "hello" or header.get("rest") is True
-        reply, pixels = self._encoded(view, image, whole, header.get("rest") is True)
+        reply, pixels = self._encoded(view, image, kind == "hello" or rest, rest)
         done = time.perf_counter()
         reply |= {
             "kind": "frame",
@@ -223,7 +222,7 @@ class Session:
             reply["parts"] = list(edit.scene.parts)
             reply["traits"] = list(edit.traits.names)
             reply["library"] = list(edit.library.names)
-        self._dragging = header.get("dragging") is True
+        self._dragging = dragging
         if not ready and not self._dragging:
             self._refine()
         if _CHANGES.intersection(header):
