@@ -19,26 +19,15 @@ from sklearn.utils.extmath import randomized_svd
 
 from data_gen.families import materials
 from data_gen.tables import Progress, table_of
+from traitbrdf.bench import MeasuredSet, measured_sets
 from traitbrdf.brdf import HalfDiffGrid
-from traitbrdf.directions import from_half_diff_angles
 from traitbrdf.embedding import FLOOR, GRID, OPPONENT
-from traitbrdf.measured import MeasuredBRDF
 
 Float64: TypeAlias = NDArray[np.float64]
 Float32: TypeAlias = NDArray[np.float32]
 
-TRUSTED = math.radians(75.0)
 HELD_OUT = 17
 """Every so many-th member of the library is encoded, not fitted to."""
-
-
-@dataclass(frozen=True)
-class Set:
-    """Materials by name, each (3, n) in 1/sr at the same angles, each (n,) in radians."""
-
-    name: str
-    angles: tuple[Float64, Float64, Float64]
-    materials: dict[str, Float64]
 
 
 @dataclass(frozen=True)
@@ -134,7 +123,7 @@ class Space:
             parts = zip(OPPONENT, (grey, colour, colour), strict=True)
             self._design = np.concatenate([t[None, :, None] * b[:, None] for t, b in parts])
 
-    def errors(self, known: Set) -> list[Float64]:
+    def errors(self, known: MeasuredSet) -> list[Float64]:
         """|d log(f + FLOOR)| (3, n) of every material of a set, encoded and decoded again."""
         index, corner = self.grid.stencil(*known.angles)
 
@@ -143,7 +132,8 @@ class Space:
 
         design, mean, w, b = (at(v) for v in (self._design, self._mean, self._w, self._b))
         found = []
-        for values in known.materials.values():
+        for rgb in known.materials.values():
+            values = np.maximum(rgb.T, 0.0)
             target = self._forward(values, w, b) - mean
             z = _robust(design.reshape(len(design), -1), target.ravel())
             shown = self._back(np.tensordot(z, design, 1) + mean, w, b)
@@ -173,32 +163,6 @@ def _robust(design: Float64, target: Float64) -> Float64:
 # -- what is judged -------------------------------------------------------------------------------
 
 
-def measured(data: Path) -> list[Set]:
-    """The measured materials of a folder: MERL slices, and RGL materials of all angles."""
-    with np.load(data / "merl_slices" / "merl_phi_d_90.npz") as file:
-        names, values = file["names"], np.maximum(file["values"].astype(np.float64), 0.0)
-    h, d = np.meshgrid(
-        (np.arange(90) / 90) ** 2 * math.pi / 2, np.radians(np.arange(90)), indexing="ij"
-    )
-    trusted = np.cos(h) * np.cos(d) > math.cos(TRUSTED)
-    angles = h[trusted], d[trusted], np.full(trusted.sum(), math.pi / 2)
-    slices = {str(n): v[trusted].T for n, v in zip(names, values, strict=True)}
-    axes = (
-        (np.arange(90) / 90) ** 2 * math.pi / 2,
-        (np.arange(16) + 0.5) / 16 * math.pi / 2,
-        (np.arange(6) + 0.5) / 6 * math.pi / 2,
-    )
-    th, td, pd = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
-    wi, wo = from_half_diff_angles(th, td, pd)
-    trusted = np.minimum(wi[:, 2], wo[:, 2]) > math.cos(TRUSTED)
-    wi, wo = wi[trusted], wo[trusted]
-    whole = {
-        path.stem: np.maximum(MeasuredBRDF.read(path).eval(wi, wo), 0.0).T
-        for path in sorted((data / "rgl").glob("*.bsdf"))
-    }
-    return [Set("MERL", angles, slices), Set("RGL", (th[trusted], td[trusted], pd[trusted]), whole)]
-
-
 def members(count: int, seed: int, grid: HalfDiffGrid) -> tuple[list[str], Float32]:
     """Names and tables (count, 3, cells) of the recipe's first members."""
     found = list(materials(seed, count))
@@ -221,7 +185,7 @@ def study(
     those for which there is data
     """
     report = progress or (lambda stage, fraction: None)
-    sets = [] if data is None else measured(data)
+    sets = [] if data is None else measured_sets(data, 16, 6)
     tables: dict[HalfDiffGrid, tuple[list[str], Float32]] = {}
     for done, candidate in enumerate(candidates):
         grid = candidate.grid
@@ -232,9 +196,11 @@ def study(
         space = Space(candidate, known[~held])
         th, td, pd = (a[grid.above_horizon] for a in grid.node_angles())
         seen = grid.above_horizon.ravel()
-        apart = {names[i]: known[i][:, seen].astype(np.float64) for i in np.flatnonzero(held)[:60]}
+        apart = {
+            names[i]: known[i][:, seen].T.astype(np.float64) for i in np.flatnonzero(held)[:60]
+        }
         result = {}
-        for one in [Set("held out", (th, td, pd), apart), *sets]:
+        for one in [MeasuredSet("held out", (th, td, pd), apart), *sets]:
             errors = space.errors(one)
             medians = [float(np.median(e)) for e in errors]
             result[one.name] = float(np.median(medians))

@@ -15,6 +15,7 @@ from data_gen import packing, study, tables
 from data_gen.families import FAMILIES, materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.packing import build
+from traitbrdf.bench import MeasuredSet
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.embedding import GRID, BRDFEmbedding
 from traitbrdf.formats import artifact, read_arrays
@@ -328,7 +329,7 @@ def test_spaces_hold_what_they_were_fitted_to():
     known = np.stack(tables).astype(np.float32)
     seen = COARSE.above_horizon.ravel()
     angles = tuple(a.ravel()[seen] for a in COARSE.node_angles())
-    one = study.Set("own", angles, {"ggx": known[2][:, seen].astype(np.float64)})
+    one = MeasuredSet("own", angles, {"ggx": known[2][:, seen].T.astype(np.float64)})
     space = study.Space(study.Candidate(colour="together", components=(2,), grid=COARSE), known)
     (error,) = space.errors(one)
     assert np.median(error) < 0.02

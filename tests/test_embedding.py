@@ -10,13 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.brdf import (
-    ALBEDO_ANGLES,
-    HalfDiffGrid,
-    TabulatedBRDF,
-    albedo_operator,
-    from_half_diff_angles,
-)
+from traitbrdf.bench import log_error, measured_sets
+from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_operator
 from traitbrdf.embedding import (
     FLOOR,
     GRID,
@@ -25,7 +20,6 @@ from traitbrdf.embedding import (
     default_embedding,
     default_library,
 )
-from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.models import GGX, BoundedPhong, Lambert
 
 EMBEDDING = default_embedding()
@@ -544,17 +538,11 @@ def test_one_sample_stays_near_the_mean():
 
 def test_measured_slices(shared_data):
     """Real materials from the phi_d = 90 degrees slice alone, on the slice."""
-    with np.load(shared_data / "merl_slices" / "merl_phi_d_90.npz") as data:
-        slices = data["values"]
-    theta_h, theta_d = np.meshgrid(
-        (np.arange(90) / 90) ** 2 * math.pi / 2, np.arange(90) / 90 * math.pi / 2, indexing="ij"
-    )
-    trusted = np.cos(theta_h) * np.cos(theta_d) > math.cos(math.radians(75.0))
-    angles = theta_h[trusted], theta_d[trusted], np.full(trusted.sum(), math.pi / 2)
-    highlight = angles[0] < math.radians(10.0)
+    slices, _ = measured_sets(shared_data)
+    highlight = slices.angles[0] < math.radians(10.0)
     errors = []
-    for values in slices:
-        error = slice_error(angles, values[trusted].astype(np.float64))
+    for rgb in slices.materials.values():
+        error = log_error(EMBEDDING, slices.angles, rgb)
         errors.append((np.median(error), np.median(error[highlight])))
     whole, peak = np.transpose(errors)
     print(f"|d log f| on {len(errors)} measured slices: median {np.median(whole):.3f}, "
@@ -566,32 +554,13 @@ def test_measured_slices(shared_data):
     assert np.quantile(peak, 0.9) <= 0.35
 
 
-def slice_error(angles, rgb):
-    """|d log f| (n, 3) of measurements encoded and decoded again."""
-    index, weight = GRID.stencil(*angles)
-    table = EMBEDDING.decode_values(EMBEDDING.encode_samples(*angles, rgb))
-    shown = np.einsum("nk,nkc->nc", weight, table[index])
-    return np.abs(np.log(shown + FLOOR) - np.log(np.maximum(rgb, 0.0) + FLOOR))
-
-
 def test_measured_materials_of_all_angles(shared_data):
     """Real materials whose whole table was measured, within 75 degrees."""
-    h, d, p = (
-        a.ravel()
-        for a in np.meshgrid(
-            (np.arange(90) / 90) ** 2 * math.pi / 2,
-            (np.arange(24) + 0.5) / 24 * math.pi / 2,
-            (np.arange(9) + 0.5) / 9 * math.pi / 2,
-            indexing="ij",
-        )
-    )
-    wi, wo = from_half_diff_angles(h, d, p)
-    trusted = np.minimum(wi[:, 2], wo[:, 2]) > math.cos(math.radians(75.0))
-    angles = h[trusted], d[trusted], p[trusted]
-    errors = {}
-    for path in sorted((shared_data / "rgl").glob("*.bsdf")):
-        rgb = np.maximum(MeasuredBRDF.read(path).eval(wi[trusted], wo[trusted]), 0.0)
-        errors[path.stem] = float(np.median(slice_error(angles, rgb)))
+    _, known = measured_sets(shared_data)
+    errors = {
+        name: float(np.median(log_error(EMBEDDING, known.angles, rgb)))
+        for name, rgb in known.materials.items()
+    }
     print("|d log f| on measured tables: " + ", ".join(f"{n} {e:.3f}" for n, e in errors.items()))
     assert len(errors) == 8
     assert np.median(list(errors.values())) <= 0.12
