@@ -702,7 +702,7 @@ class MeasuredSet:
 
 
 def measured_sets(data: Path, n_theta_d: int = 24, n_phi_d: int = 9) -> list[MeasuredSet]:
-    """MERL slices at phi_d = 90 degrees, and RGL materials of all angles, within `MEASURED_WITHIN`."""
+    """MERL slices (phi_d 90 degrees) and RGL materials (all angles), within `MEASURED_WITHIN`."""
     theta_h = (np.arange(90) / 90) ** 2 * math.pi / 2
     h, d = np.meshgrid(theta_h, np.arange(90) / 90 * math.pi / 2, indexing="ij")
     trusted = np.cos(h) * np.cos(d) > math.cos(MEASURED_WITHIN)
