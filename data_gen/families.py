@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from data_gen.spectra import SPECTRA, indices
 from traitbrdf.brdf import Reflectance
 from traitbrdf.models import (
     ABC,
@@ -64,24 +65,8 @@ class Material:
     parameters: Parameters
 
 
-# Index of refraction and extinction (R, G, B) as collected by refractiveindex.info from Johnson &
-# Christy (1972, 1974), Rakic (1995, 1998) and others: at 650, 550 and 450 nm, nickel's blue at
-# 400 nm. Chromium at 642, 529 and 464 nm, from the table in common use in renderers.
-METALS: Mapping[str, tuple[RGB, RGB]] = MappingProxyType(
-    {
-        "aluminium": ((1.3456, 0.96521, 0.61722), (7.4746, 6.3995, 5.3031)),
-        "brass": ((0.444, 0.527, 1.094), (3.695, 2.765, 1.829)),
-        "copper": ((0.27105, 0.67693, 1.3164), (3.6092, 2.6248, 2.2921)),
-        "gold": ((0.18299, 0.42108, 1.3734), (3.4242, 2.3459, 1.7704)),
-        "iron": ((2.9114, 2.9497, 2.5845), (3.0893, 2.9318, 2.7670)),
-        "lead": ((1.91, 1.83, 1.44), (3.51, 3.40, 3.18)),
-        "platinum": ((2.3757, 2.0847, 1.8453), (4.2655, 3.7153, 3.1365)),
-        "silver": ((0.15943, 0.14512, 0.13547), (3.9291, 3.1900, 2.3808)),
-        "titanium": ((2.7407, 2.5418, 2.2670), (3.8143, 3.4345, 3.0385)),
-        "nickel": ((2.013, 1.772, 1.610), (3.806, 3.252, 2.360)),
-        "chrome": ((3.11847, 3.02492, 2.44207), (3.3190, 3.3322, 3.2034)),
-    }
-)
+METALS: Mapping[str, tuple[RGB, RGB]] = MappingProxyType({m: indices(m) for m in SPECTRA})
+"""Index of refraction and extinction (R, G, B), from spectra."""
 
 COLOURS: Mapping[str, RGB] = MappingProxyType(
     {

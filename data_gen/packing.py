@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.tables import Progress, Tables
-from traitbrdf.embedding import GRID, BRDFEmbedding
+from traitbrdf.embedding import FLOOR, GRID, BRDFEmbedding
 from traitbrdf.traits import TraitSpace
 
 COUNT = 2040
 SEED = 0
-COMPONENTS = (14, 5)
+COMPONENTS = (16, 4)
 
 
 def build(
@@ -54,7 +54,8 @@ def build(
     embedding = BRDFEmbedding.from_arrays(embedding.fit(tables).arrays())
     encoded, rows = [], []
     for table in tables:
-        encoded.append(embedding.encode(table))
+        logs = np.log(table.values.reshape(1, -1, 3) + np.float32(FLOOR)).transpose(0, 2, 1)
+        encoded.append(embedding.least_squares(logs)[0])
         rows.append(descriptors(table))
     coordinates = np.stack(encoded).astype(np.float32)
     embedding.low_ = coordinates.min(axis=0).astype(np.float64)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen import families
+from data_gen import families, spectra
 from traitbrdf import brdf, models
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.formats import atomic_path
@@ -129,6 +129,6 @@ class Tables:
 def _key(seed: int, grid: HalfDiffGrid) -> str:
     """What tables depend on: other recipes or models make other files."""
     digest = hashlib.sha256(repr((seed, grid)).encode())
-    for module in (families, models, brdf):
+    for module in (families, spectra, models, brdf):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:12]

@@ -47,7 +47,7 @@ def on_the_manifold(z):
     """The decoded table of z as it is before black cells and the albedo are clipped."""
     clipped = EMBEDDING.clip(z)
     table = EMBEDDING.decode_values(clipped)
-    logs = EMBEDDING.mean_[:, None] + EMBEDDING.components_ @ channels(clipped)
+    logs = decent(EMBEDDING.mean_[:, None] + EMBEDDING.components_ @ channels(clipped))
     return table, np.allclose(table, np.exp(logs) - FLOOR, rtol=1e-3, atol=1e-6)
 
 
@@ -72,10 +72,25 @@ def axes(z):
     return np.split(np.asarray(z), [achromatic, achromatic + chromatic])
 
 
+def decent(logs):
+    """What `profiles` says of log f (cells, 3), profile by profile."""
+    known = EMBEDDING._profiles
+    result = np.array(logs, np.float64).reshape(GRID.n_theta_h, -1, 3)
+    for j, c in np.ndindex(*result.shape[1:]):
+        x, m = result[:, j, c], known.inner[j]
+        allowed = known.share[:, j] * max(x[known.last[j]] - x[0], 0.0) + known.grazing[:, j]
+        x = x - allowed
+        x[:m] = np.maximum.accumulate(x[:m][::-1])[::-1]
+        x = np.minimum.accumulate(x) + allowed
+        x[:m] = np.minimum(np.maximum.accumulate(x[:m]), np.maximum.accumulate(x[:m][::-1])[::-1])
+        result[:, j, c] = x
+    return result.reshape(-1, 3)
+
+
 def exact(z, offset=None, cells=slice(None)):
     """What `decode_values` promises, in float64 and independent of its code."""
     logs = EMBEDDING.components_.astype(np.float64) @ channels(EMBEDDING.clip(z))
-    logs += EMBEDDING.mean_[:, None]
+    logs = decent(logs + EMBEDDING.mean_[:, None])
     logs += 0.0 if offset is None else offset
     values = np.maximum(np.exp(np.minimum(logs, 30.0)) - FLOOR, 0.0)
     albedo = (albedo_operator(GRID, ALBEDO_ANGLES) @ values).max()
@@ -113,7 +128,7 @@ BRIGHT = EMBEDDING.clip(
     PLASTER + 4.0 * LIFT / (LIFT @ LIFT) + np.repeat([0.0, 0.02, -0.01], AXES) * SPAN
 )
 BRIGHT = CENTRE + 0.99 * (BRIGHT - CENTRE)  # off the faces of the box
-SCALED = EMBEDDING.clip(min(LIBRARY.coordinates, key=EMBEDDING.energy_scale))
+SCALED = EMBEDDING.clip(PLASTER + 0.9 * LIFT / (LIFT @ LIFT))
 points = pytest.mark.parametrize("z", [DIM, SCALED, BRIGHT], ids=["dim", "scaled", "bright"])
 offsets = pytest.mark.parametrize("offset", [None, some_offset(1)], ids=["alone", "offset"])
 
@@ -766,4 +781,4 @@ def test_energy_scale_says_how_much_decode_lowers():
     assert 0.0 < scale < 1.0
     raw, albedo = EMBEDDING._decode(bright, None)
     assert scale == pytest.approx(1.0 / albedo)
-    np.testing.assert_allclose(EMBEDDING.decode_values(bright), raw * scale, rtol=1e-5)
+    np.testing.assert_allclose(EMBEDDING.decode_values(bright), raw.T * scale, rtol=1e-5)

@@ -27,14 +27,21 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf import editing, models, reference
-from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.brdf import (
+    ALBEDO_ANGLES,
+    HalfDiffGrid,
+    Reflectance,
+    TabulatedBRDF,
+    albedo_operator,
+)
 from traitbrdf.directions import from_half_diff_angles, to_local
 from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession, trusted_error
 from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
 from traitbrdf.lights import EnvironmentMap, texel_moments
 from traitbrdf.measured import MeasuredBRDF
+from traitbrdf.profiles import HIGHLIGHT
 from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import teapot
+from traitbrdf.shapes import sphere, teapot
 from traitbrdf.traits import default_traits
 from traitbrdf.transport import Operator, Training, Transport, training_tables
 
@@ -635,7 +642,8 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Embedding error: measured materials that the library knows nothing of, and decoding times."""
+    """Embedding error: measured materials that the library knows nothing of, rendered ones, what
+    random coordinates look like, and decoding times."""
     library = default_library()
     embedding = library.embedding
     grid, k = embedding.grid_, embedding.size
@@ -661,6 +669,8 @@ def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record
                 say(f"  {name}: {median:.3f}")
             yield Record.at_most(f"{known.name}, median", middle, "", 0.12, how=how)
             yield Record(f"{known.name}, maximum", max(medians.values()), "", how=how)
+    yield from _rendered_error(embedding, data, quick, say)
+    yield from _gamut(embedding, 100 if quick else 10_000)
     z = library.coordinates[library.index("blue-plastic")]
     rng = np.random.default_rng(0)
     cells = np.sort(rng.choice(grid.size, min(16_000, grid.size), replace=False))
@@ -686,6 +696,105 @@ def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record
         how=f"grid {fine.shape}; error: there and back, by the lower cosine",
     )
 
+
+def _rendered_error(
+    embedding: BRDFEmbedding, data: Path | None, quick: bool, say: Say
+) -> Iterator[Record]:
+    """A sphere of materials that were encoded, beside the sphere of the materials themselves."""
+    every = dict(maps(data, quick))
+    three = {name: every[name] for name in RENDERED_UNDER if name in every} or every
+    size = 32 if quick else 96
+    grid, k = embedding.grid_, embedding.size
+    files = sorted((data / "rgl").glob("*.bsdf")) if data else []
+    sets = {
+        "RGL": [TabulatedBRDF.from_model(MeasuredBRDF.read(f), grid, f.stem) for f in files],
+        # two of every family: members that the library would have under another seed
+        "held-out library": fresh_recipes(4 if quick else 68, seed=2),
+    }
+    for kind, tables in sets.items():
+        if not tables:
+            continue
+        start = time.perf_counter()
+        shown = [embedding.decode(embedding.encode(table)) for table in tables]
+        seconds = (time.perf_counter() - start) / len(tables)
+        linear, exposed, error = [], [], []
+        for environment in three.values():
+            operator = Operator(Scene(sphere(), environment, size=size), grid)
+            images = _own_colours(operator.part_images(0, _channels([*tables, *shown])))
+            for true, found in zip(*np.split(images.swapaxes(0, 1), 2), strict=True):
+                square = float(np.mean((true - found) ** 2))
+                linear.append(_decibels(float(true.max()), square))
+                # as a picture: nine tenths of the pixels below 0.8
+                scale = 0.8 / np.quantile(true.max(axis=1), 0.9)
+                clipped = np.clip([true * scale, found * scale], 0.0, 1.0)
+                exposed.append(_decibels(1.0, float(np.mean((clipped[0] - clipped[1]) ** 2))))
+                error.append(reference.relative_error(found, true))
+        worst = int(np.argmax(np.reshape(error, (len(three), -1)).mean(axis=0)))
+        say(f"  {kind}, rendered: worst {tables[worst].name}")
+        how = (
+            f"{len(tables)} materials, {k} numbers each, on a sphere of {size}x{size} under "
+            f"{', '.join(three)}; encoded in {seconds:.2f} s each"
+        )
+        middle = 100.0 * float(np.median(error))
+        if kind == "RGL":
+            peak, mean = f"peak: the brightest of the image; {how}", float(np.mean(linear))
+            yield Record.at_least(f"{kind}, rendered, mean PSNR", mean, "dB", 42.0, how=peak)
+            yield Record(f"{kind}, rendered L1, median", middle, "%", how=how)
+        else:
+            yield Record.at_most(f"{kind}, rendered L1, median", middle, "%", 1.0, how=how)
+        picture = f"exposed and clipped, peak 1; {how}"
+        mean = float(np.mean(exposed))
+        yield Record(f"{kind}, rendered as a picture, mean PSNR", mean, "dB", how=picture)
+
+
+def _decibels(peak: float, square: float) -> float:
+    return 10.0 * math.log10(peak**2 / max(square, 1e-20))
+
+
+def _gamut(embedding: BRDFEmbedding, count: int) -> Iterator[Record]:
+    """Random coordinates of the gamut box: passive, and without holes in their highlights."""
+    rng = np.random.default_rng(0)
+    grid = embedding.grid_
+    rows = albedo_operator(grid, ALBEDO_ANGLES)
+    least, albedo, hole = math.inf, 0.0, []
+    for _ in range(count):
+        values = embedding.decode_values(rng.uniform(embedding.low_, embedding.high_))
+        least = min(least, float(values.min()))
+        albedo = max(albedo, float((rows @ values).max()))
+        hole.append(highlight_hole(grid, values))
+    how = f"{count} random points of the box, {grid.size} cells each"
+    yield Record.at_least("random coordinates, least f", least, "1/sr", 0.0, how=how)
+    yield Record.at_most("random coordinates, greatest albedo", albedo, "", 1.001, how=how)
+    deepest = 100.0 * float(np.max(hole))
+    yield Record.at_most("random coordinates, deepest hole", deepest, "%", 2.0, how=how)
+
+
+def highlight_hole(grid: HalfDiffGrid, values: NDArray[Any]) -> float:
+    """The deepest valley in a highlight of f (cells, 3): what f is lower by there, relative to the
+    lower one of its rims along theta_h.
+
+    The highlight: theta_h to 30 degrees, as far around its brightest node as f exceeds a tenth of
+    it; profiles of theta_d to 60 degrees, both directions within 75 degrees of the normal.
+    """
+    kept = (grid.theta_d <= math.radians(60.0)).repeat(grid.n_phi_d)
+    nodes = grid.theta_h <= HIGHLIGHT
+    f = values.reshape(grid.n_theta_h, -1, 3)[nodes][:, kept]
+    seen = grid.lower_cosine.reshape(grid.n_theta_h, -1)[nodes][:, kept] > math.cos(MEASURED_WITHIN)
+    f = np.where(seen[..., None], f, 0.0)
+    bright = f > 0.1 * f.max(axis=0)
+    node = np.arange(len(f))[:, None, None]
+    top = f.argmax(axis=0)
+    first = np.where(~bright & (node < top), node, -1).max(axis=0)
+    last = np.where(~bright & (node > top), node, len(f)).min(axis=0)
+    lobe = np.where((node > first) & (node < last), f, 0.0)
+    before = np.maximum.accumulate(lobe, axis=0)
+    after = np.maximum.accumulate(lobe[::-1], axis=0)[::-1]
+    rim = np.minimum(before, after)
+    return float(np.max(np.where(lobe > 0.0, 1.0 - lobe / np.maximum(rim, 1e-30), 0.0)))
+
+
+RENDERED_UNDER = ("forest", "studio", "sunset")
+"""Maps of a forest, of lamps indoors, of a low sun."""
 
 MEASURED_WITHIN = math.radians(75.0)
 """Beyond this angle measurements are extrapolated or unreliable."""

@@ -3,7 +3,7 @@
 A table's values are mapped by y = log(f + FLOOR). Matusik et al. ("A Data-Driven Reflectance
 Model", SIGGRAPH 2003) take one vector of all colours for each material; here the mean of the three
 channels' logarithms and their differences (red against blue, green against magenta) are embedded
-apart, by two PCAs: materials differ in many ways in shape and in few in colour. With m = (14, 5)
+apart, by two PCAs: materials differ in many ways in shape and in few in colour. With m = (16, 4)
 components a material has k = 24 coordinates: 14 achromatic ones first, then 5 for red against blue,
 then 5 for green against magenta; each axis is scaled to unit variance.
 """
@@ -13,15 +13,28 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 import scipy.optimize
+import scipy.sparse
+import scipy.spatial
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import sph_harm_y
 
-from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, Reflectance, TabulatedBRDF, albedo_operator
+from traitbrdf.brdf import (
+    ALBEDO_ANGLES,
+    HalfDiffGrid,
+    Reflectance,
+    TabulatedBRDF,
+    albedo_operator,
+    hemisphere_nodes,
+)
+from traitbrdf.directions import fold_phi_d, from_half_diff_angles
 from traitbrdf.formats import artifact, unknown_name
+from traitbrdf.profiles import Profiles
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -53,6 +66,15 @@ _BATCH = 128
 _NOISE = 0.1
 """Assumed deviation of log f from the manifold, where samples are encoded."""
 
+_SEEN = 8e-4
+"""Assumed deviation of what is seen, relative to all of it, under light as it is found."""
+
+_ENERGY = 0.9
+"""How much the light that a cell reflects counts when a library is fitted; the rest is even."""
+
+_PASSES = 2
+"""How often the components are found anew with these weights."""
+
 _ROUNDS = 25
 """At most so many times are the weights of samples found anew."""
 
@@ -60,31 +82,11 @@ _ROBUST = 0.03
 """Deviation of log f beyond which a sample counts less, as the inverse of it: what is nearly the
 least sum of absolute deviations follows most samples, not the worst."""
 
+_PRIOR = 0.01
+"""Precision of the library's spread, where a point is refined: next to nothing."""
+
 _TIE = 1e-6
 """Relative distance at which two albedos count as equal: the channels of a grey material."""
-
-
-class _Rows(NamedTuple):
-    """The basis at some cells, as arrays or as tensors; colours first, which is the faster way.
-
-    index : (n,) flat cell indices, or slice(None)
-    basis : (m, n)
-    mean : (n,)
-    """
-
-    index: Any
-    basis: Any
-    mean: Any
-
-    def logs(self, scores: Any, offset: Any) -> Any:
-        """log(f + FLOOR) (3, n) of channel scores (3, m), with an offset (cells, 3) or None."""
-        logs = _product(scores, self.basis)
-        logs += self.mean
-        if offset is not None:
-            whole = isinstance(self.index, slice) or isinstance(offset, torch.Tensor)
-            # numpy's take of rows is ten times as fast as its indexing
-            logs += (offset[self.index] if whole else offset.take(self.index, axis=0)).T
-        return logs
 
 
 def _product(a: Any, b: Any) -> Any:
@@ -96,14 +98,14 @@ def _product(a: Any, b: Any) -> Any:
 
 
 class _Tensors(NamedTuple):
-    """What `BRDFEmbedding.decode_tensor` needs, on one device and in one precision."""
+    """What decoding needs, on one device and in one precision."""
 
-    every: _Rows
-    checked: _Rows
-    check: torch.Tensor
+    basis: torch.Tensor  # (m, cells)
+    mean: torch.Tensor  # (cells,)
+    check: torch.Tensor  # (cells, 16) what turns f into directional albedos
+    mixing: torch.Tensor  # (3, m, k)
     low: torch.Tensor
     high: torch.Tensor
-    mixing: torch.Tensor
 
 
 class BRDFEmbedding:
@@ -112,7 +114,7 @@ class BRDFEmbedding:
     Parameters
     ----------
     n_components : (int, int)
-        Components of the mean of the channels, and of each of the two colour axes: (14, 5) makes
+        Components of the mean of the channels, and of each of the two colour axes: (16, 4) makes
         14 + 2 * 5 coordinates. One number stands for both.
 
     Attributes
@@ -127,7 +129,7 @@ class BRDFEmbedding:
     explained_variance_ratio_ : (m,) float64, of the whole variance
     """
 
-    def __init__(self, n_components: int | tuple[int, int] = (14, 5)) -> None:
+    def __init__(self, n_components: int | tuple[int, int] = (16, 4)) -> None:
         try:
             pair = (n_components,) * 2 if isinstance(n_components, int) else tuple(n_components)
         except TypeError:
@@ -176,11 +178,72 @@ class BRDFEmbedding:
         self.components_ = np.concatenate([grey[0], colour[0]], axis=1)
         variance = np.concatenate([grey[1], 2.0 * colour[1]])
         self.explained_variance_ratio_ = variance / (grey[2] + 2.0 * colour[2])
+        for _ in range(_PASSES):
+            self._reweighted(tables)
+        self._profiles = Profiles.of(lambda: _batches(tables), self.grid_)
         self._prepare()
-        encoded = (self.encode(table) for table in tables)
-        coordinates = np.stack(list(encoded))
+        coordinates = np.concatenate([self.least_squares(logs) for logs in _batches(tables)])
         self.low_, self.high_ = coordinates.min(axis=0), coordinates.max(axis=0)
         return self
+
+    def _reweighted(self, tables: Iterable[TabulatedBRDF]) -> None:
+        """Components and mean found anew, by weights that follow the light which a cell reflects.
+
+        Weighted low-rank approximation by alternating least squares (Srebro & Jaakkola, "Weighted
+        Low-Rank Approximations", ICML 2003, section 3).
+        """
+        size = self.components_.shape[1] + 1
+        upper = np.triu_indices(size)
+        gram = torch.zeros((len(upper[0]), self.grid_.size), dtype=torch.float64)
+        pull = torch.zeros((size, self.grid_.size), dtype=torch.float64)
+        squares, count = np.zeros(self.size), 0
+        for logs in _batches(tables):
+            z = self.least_squares(logs)
+            squares, count = squares + np.sum(z**2, axis=0), count + len(z)
+            scores = np.einsum("cmk,nk->ncm", self._mixing, z)
+            scores = np.concatenate([scores, np.ones((*scores.shape[:2], 1))], axis=2)
+            rows = torch.from_numpy(scores.reshape(-1, size).astype(np.float32))
+            weight = torch.from_numpy(self._fit_weight(logs).reshape(len(rows), -1))
+            weight += 1e-8  # cells below the horizon are interpolated with, and so fitted too
+            gram += (rows[:, upper[0]] * rows[:, upper[1]]).T @ weight
+            weight *= torch.from_numpy(logs.reshape(len(rows), -1))
+            pull += rows.T @ weight
+        whole = np.empty((self.grid_.size, size, size))
+        whole[:, upper[0], upper[1]] = whole[:, upper[1], upper[0]] = gram.numpy().T
+        whole += 1e-7 * np.trace(whole, axis1=1, axis2=2)[:, None, None] / size * np.eye(size)
+        found = np.linalg.solve(whole, pull.numpy().T[..., None])[..., 0]
+        deviation = np.sqrt(np.maximum(squares / count, 1e-30))
+        achromatic = self.n_components[0]
+        colour = np.sqrt(0.5 * np.sum(deviation[achromatic:].reshape(2, -1) ** 2, axis=0))
+        found[:, :-1] *= np.concatenate([deviation[:achromatic], colour])
+        self.components_ = np.ascontiguousarray(found[:, :-1], np.float32)
+        self.mean_ = np.ascontiguousarray(found[:, -1], np.float32)
+
+    def _fit_weight(self, logs: Float32) -> Float32:
+        """(n, 3, cells) what the cells of log(f + FLOOR) count: each material 3 in all."""
+        even = self.weight_**2 / np.sum(self.weight_**2)
+        shown = np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0) * _exposure(self.grid_)
+        shown *= 3.0 * _ENERGY / np.maximum(shown.sum(axis=(1, 2), keepdims=True), 1e-30)
+        shown += (1.0 - _ENERGY) * even
+        weight: Float32 = shown
+        return weight
+
+    def least_squares(self, logs: Float32) -> Float64:
+        """Coordinates (n, k) of log(f + FLOOR) (n, 3, cells): the fit's own, and where `encode`
+        begins.
+
+        Weighted by the light that a cell reflects, neither robust nor clipped to the gamut.
+        """
+        components = torch.from_numpy(self.components_)
+        found = np.empty((len(logs), self.size))
+        for i, (weights, target) in enumerate(zip(self._fit_weight(logs), logs, strict=True)):
+            gram, pull = 1e-6 * np.eye(self.size), np.zeros(self.size)
+            for mixing, weight, log in zip(self._mixing, weights, target, strict=True):
+                weighted = components.T * torch.from_numpy(weight)
+                gram += mixing.T @ (weighted @ components).numpy() @ mixing
+                pull += mixing.T @ (weighted @ torch.from_numpy(log - self.mean_)).numpy()
+            found[i] = np.linalg.solve(gram, pull)
+        return found
 
     def _axes(
         self, tables: Iterable[TabulatedBRDF], axes: slice, count: int, materials: int
@@ -223,23 +286,11 @@ class BRDFEmbedding:
         return np.ascontiguousarray(loadings, np.float32), total * shares, total
 
     def _prepare(self) -> None:
-        """What follows from the fitted state: the projection and the albedo check."""
-        squared = (self.weight_.astype(np.float64) ** 2)[:, None]
-        self._project = []
-        for own in np.split(self.components_.astype(np.float64), [self.n_components[0]], axis=1):
-            weighted = own * squared
-            self._project.append(np.linalg.solve(weighted.T @ own, weighted.T))
-        self._albedo = albedo_operator(self.grid_, ALBEDO_ANGLES).astype(np.float32)
-        # the energy check by itself, for when only some cells are decoded: three quarters of the
-        # grid, so a dense product is faster than the sparse one
-        checked = np.unique(self._albedo.indices)
-        self._check: Float32 = np.ascontiguousarray(self._albedo[:, checked].toarray().T)
-        self._every = _Rows(slice(None), np.ascontiguousarray(self.components_.T), self.mean_)
-        self._checked = _Rows(
-            checked, np.ascontiguousarray(self.components_[checked].T), self.mean_[checked]
-        )
-        fan = self._mixing.transpose(1, 0, 2).reshape(self.components_.shape[1], -1)
-        self._fan = np.ascontiguousarray(fan, np.float32)
+        """What follows from the fitted state: the basis as decoding reads it, the albedo check."""
+        self._basis = np.ascontiguousarray(self.components_.T)
+        check = albedo_operator(self.grid_, ALBEDO_ANGLES).astype(np.float32)
+        # three quarters of the cells count, so a dense product is faster than the sparse one
+        self._check: Float32 = np.ascontiguousarray(check.toarray().T)
         self._tensors: dict[tuple[torch.device, torch.dtype], _Tensors] = {}
 
     def __repr__(self) -> str:
@@ -285,10 +336,64 @@ class BRDFEmbedding:
             table = brdf.regrid(self.grid_)
         else:
             table = TabulatedBRDF.from_model(brdf, self.grid_)
-        logs = _log_map(table.values).reshape(-1, 3) - self.mean_[:, None]
-        grey, red_blue, green = (logs @ OPPONENT.T).T
-        achromatic, chromatic = self._project
-        return np.concatenate([achromatic @ grey, chromatic @ red_blue, chromatic @ green])
+        logs = np.ascontiguousarray(_log_map(table.values).reshape(-1, 3).T)
+        weight = np.repeat(self.weight_[None].astype(np.float64) ** 2, 3, axis=0)
+        weight *= 3.0 * 1000.0 / _NOISE**2 / weight.sum()
+        return self._refined(self.clip(self.least_squares(logs[None])[0]), logs, weight)
+
+    def _refined(self, start: Float64, logs: Float32, weight: Float64) -> Float64:
+        """The point of the gamut that shows log(f + FLOOR) (3, cells) best, from a near one.
+
+        What is made least: deviations of log f, by `weight` (3, cells) and robust (`_ROBUST`); and
+        deviations of what is seen under light as it is found (`_natural_light`), relative to all
+        of it, by `_SEEN`. Levenberg and Marquardt's steps, within the box.
+        """
+        light = _natural_light(self.grid_)
+        given = torch.from_numpy(np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0))
+        seen = light @ given.T
+        precision = 1.0 / (_SEEN**2 * max(float((seen**2).sum()), 1e-30))
+
+        def misfit(z: Float64) -> tuple[float, Float32, Any]:
+            shown = self.decode_values(z)
+            away = _log_map(shown).T - logs
+            robust = np.minimum(np.abs(away), _ROBUST)
+            cost = float(np.sum(weight * robust * (np.abs(away) - 0.5 * robust)))
+            apart = light @ torch.from_numpy(shown) - seen
+            cost += 0.5 * precision * float((apart**2).sum()) + 0.5 * _PRIOR * float(z @ z)
+            return cost, away, apart
+
+        z, damping = start, 1e-3
+        cost, away, apart = misfit(z)
+        for _ in range(_ROUNDS):
+            slopes = self.jacobian(z)
+            shown = self.decode_values(z)
+            gram, pull = _PRIOR * np.eye(self.size), _PRIOR * z
+            count = (weight * _ROBUST / np.maximum(np.abs(away), _ROBUST)).astype(np.float32)
+            for colour in range(3):
+                slope = torch.from_numpy(np.ascontiguousarray(slopes[:, colour]))
+                turned = light @ slope
+                gram = gram + precision * (turned.T @ turned).numpy()
+                pull = pull + precision * (turned.T @ apart[:, colour]).numpy()
+                slope /= torch.from_numpy(shown[:, colour, None] + np.float32(FLOOR))
+                counted = slope * torch.from_numpy(count[colour])[:, None]
+                gram = gram + (counted.T @ slope).numpy()
+                pull = pull + (counted.T @ torch.from_numpy(away[colour])).numpy()
+            before = cost
+            for _ in range(8):
+                root = np.linalg.cholesky(gram + damping * np.diag(np.diag(gram)))
+                aim = np.linalg.solve(root, -pull)
+                least, most = self.low_ - z - 1e-12, self.high_ - z + 1e-12
+                step = scipy.optimize.lsq_linear(root.T, aim, (least, most)).x
+                moved = self.clip(z + step)
+                trial = misfit(moved)
+                if trial[0] < cost:
+                    z, (cost, away, apart) = moved, trial
+                    damping = max(0.2 * damping, 1e-6)
+                    break
+                damping *= 8.0
+            if before - cost < 1e-3 * before:
+                break
+        return z
 
     @overload
     def encode_samples(
@@ -376,9 +481,33 @@ class BRDFEmbedding:
             root = np.linalg.cholesky(gram)
             aim = np.linalg.solve(root, pull)
             z = scipy.optimize.lsq_linear(root.T, aim, (self.low_, self.high_)).x
+        known = self.decode_values(z).astype(np.float64)
+        shown = np.einsum("nk,nkc->nc", corner, known[index])
+        rest = np.log(values[valid] + FLOOR) - np.log(shown + FLOOR)
+        logs = _log_map(known).T + self._spread(rest, *(a[valid] for a in angles))
+        cells = np.bincount(index.ravel(), corner.ravel(), self.grid_.size)
+        z = self._refined(z, logs, np.repeat(precision * cells[None], 3, axis=0))
         if not return_std:
             return z
         return z, np.sqrt(np.diag(np.linalg.inv(gram)))
+
+    def _spread(self, rest: Float64, theta_h: Float64, theta_d: Float64, phi_d: Float64) -> Float32:
+        """(3, cells) what samples say beside a first guess, of cells around them: fading away from
+        them, slowest along phi_d, and the median of fifteen so that outliers do not spread."""
+
+        def place(h: Float64, d: Float64, p: Float64) -> Float64:
+            along = np.sqrt(h.ravel() * 2.0 / math.pi) * 15.0, d.ravel() * 4.0, p.ravel()
+            return np.stack(along, axis=1)
+
+        folded = np.asarray(fold_phi_d(phi_d), np.float64)
+        tree = scipy.spatial.cKDTree(place(np.abs(theta_h), theta_d, folded))
+        near = min(15, len(rest))
+        distance, nearest = tree.query(place(*self.grid_.node_angles()), near)
+        nearest = nearest.reshape(-1, near)
+        fade = np.exp(-(distance.reshape(-1, near)[:, 0] ** 2))
+        middle = np.clip(np.median(rest[nearest], axis=1), -1.0, 1.0)
+        spread = middle * fade[:, None]
+        return np.ascontiguousarray(spread.T, np.float32)
 
     def clip(self, z: ArrayLike) -> Float64:
         """The nearest point (k,) in the gamut box."""
@@ -408,10 +537,13 @@ class BRDFEmbedding:
         ValueError
             On a wrong shape, coordinates that are not finite, or an index outside the grid.
         """
-        values, albedo = self._decode(z, offset, cells)
+        values, albedo = self._decode(z, offset)
+        if cells is not None:
+            values = values.take(self._cell_indices(cells), axis=1)
+        shown: Float32 = np.ascontiguousarray(values.T)
         if albedo > 1.0:
-            values /= np.float32(albedo * _MARGIN)
-        return values
+            shown /= np.float32(albedo * _MARGIN)
+        return shown
 
     def energy_scale(self, z: ArrayLike, offset: Float32 | None = None) -> float:
         """The factor in (0, 1] by which `decode_values` lowers f to keep the albedo within 1.
@@ -453,25 +585,46 @@ class BRDFEmbedding:
         point = self.as_coordinates(z)
         clipped = self.clip(point)
         self._check_offset(offset)
-        rows = self._rows(cells)
-        scores = (self._mixing @ clipped).astype(np.float32)
-        logs = rows.logs(scores, offset)
-        albedo = self._check_albedos(scores, offset)
+        logs, source, share = self._profiles.sources(self._logs(clipped))
+        if offset is not None:
+            logs += offset.T
+        index = slice(None) if cells is None else self._cell_indices(cells)
+        slope = _slope(logs)
+        albedo = _reflectance(np, logs.copy()) @ self._check
         greatest = float(albedo.max())
         scale = 1.0 / (greatest * _MARGIN) if greatest > 1.0 else 1.0
-        # d log(f + FLOOR) of colour c by a coordinate is the sum of mixing[c, m] basis[m]
-        result: Float32 = (rows.basis.T @ self._fan).reshape(-1, 3, self.size)
-        result *= (_slope(logs) * np.float32(scale)).T[..., None]
+        result = np.stack(
+            [
+                self._log_slopes(c, source[c][index], share[c][index])
+                * (slope[c][index, None] * np.float32(scale))
+                for c in range(3)
+            ],
+            axis=1,
+        )
         if greatest > 1.0:
             tied = _tied(albedo)
-            weight = (tied / np.float32(tied.sum())) @ self._check.T
-            weight *= _slope(self._checked.logs(scores, offset))
-            by_score = (self._checked.basis @ weight.T).T[..., None]
-            rise = np.sum(by_score * self._mixing, axis=(0, 1)).astype(np.float32)
-            values = _reflectance(np, logs, out=logs) * np.float32(scale / greatest)
-            result -= values.T[..., None] * rise
+            weight = (tied / np.float32(tied.sum())) @ self._check.T * slope
+            rise = np.sum(
+                [weight[c] @ self._log_slopes(c, source[c], share[c]) for c in range(3)],
+                axis=0,
+            )
+            values = _reflectance(np, logs[:, index]) * np.float32(scale / greatest)
+            result -= values.T[..., None] * rise.astype(np.float32)
         result[..., point != clipped] = 0.0
         return result
+
+    def _log_slopes(self, colour: int, source: NDArray[np.int64], share: Float32) -> Float32:
+        """d log(f + FLOOR) / d z (n, k) of one colour, at cells of which `Profiles.sources` says
+        where they come from."""
+        rows = self.components_.take(source, axis=0)
+        some = np.flatnonzero(share)
+        if len(some):
+            last = self._profiles.last
+            own = source[some] % len(last)
+            trend = self.components_[last[own] * len(last) + own] - self.components_[own]
+            rows[some] += share[some, None] * trend
+        slopes: Float32 = _product(rows, self._mixing[colour].astype(np.float32))
+        return slopes
 
     def decode_tensor(
         self,
@@ -513,16 +666,17 @@ class BRDFEmbedding:
             whole = offset if isinstance(offset, torch.Tensor) else torch.tensor(offset)
             offset = whole.to(z)
         on = self._on(z.device, z.dtype)
-        rows = on.every
-        if cells is not None:
-            index = torch.tensor(self._cell_indices(cells), device=z.device)
-            rows = _Rows(index, rows.basis[:, index], rows.mean[index])
-        scores = on.mixing @ torch.clamp(z, on.low, on.high)
-        values = _reflectance(torch, rows.logs(scores, offset)).T
-        albedo = _reflectance(torch, on.checked.logs(scores, offset)) @ on.check
+        span = on.mixing @ torch.clamp(z, on.low, on.high) @ on.basis + on.mean
+        logs = self._profiles.keep(span)
+        if offset is not None:
+            logs = logs + offset.T
+        f = _reflectance(torch, logs)
+        albedo = f @ on.check
         tied = _tied(albedo)
         greatest = torch.where(tied, albedo, 0.0).sum() / tied.sum()
-        scaled: torch.Tensor = values / torch.where(greatest > 1.0, greatest * _MARGIN, 1.0)
+        if cells is not None:
+            f = f[:, torch.tensor(self._cell_indices(cells), device=z.device)]
+        scaled: torch.Tensor = f.T / torch.where(greatest > 1.0, greatest * _MARGIN, 1.0)
         return scaled
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> _Tensors:
@@ -536,24 +690,14 @@ class BRDFEmbedding:
             # tensors made in inference mode could not be differentiated through later
             with torch.inference_mode(False):
                 self._tensors[key] = _Tensors(
-                    _Rows(slice(None), tensor(self._every.basis), tensor(self._every.mean)),
-                    _Rows(
-                        tensor(self._checked.index, torch.int64),
-                        tensor(self._checked.basis),
-                        tensor(self._checked.mean),
-                    ),
+                    tensor(self._basis),
+                    tensor(self.mean_),
                     tensor(self._check),
+                    tensor(self._mixing),
                     tensor(self.low_),
                     tensor(self.high_),
-                    tensor(self._mixing),
                 )
         return self._tensors[key]
-
-    def _rows(self, cells: ArrayLike | None) -> _Rows:
-        if cells is None:
-            return self._every
-        index = self._cell_indices(cells)
-        return _Rows(index, self.components_.take(index, axis=0).T, self.mean_[index])
 
     def _cell_indices(self, cells: ArrayLike) -> NDArray[np.int64]:
         index = np.asarray(cells)
@@ -574,23 +718,22 @@ class BRDFEmbedding:
         if offset is not None and offset.shape != expected:
             raise ValueError(f"offset: expected shape {expected}, got {tuple(offset.shape)}")
 
-    def _decode(
-        self, z: ArrayLike, offset: Float32 | None, cells: ArrayLike | None = None
-    ) -> tuple[Float32, float]:
-        """f (n, 3) before its energy is checked, and its greatest directional albedo."""
+    def _logs(self, z: ArrayLike) -> Float32:
+        """log(f + FLOOR) (3, cells) of the linear span, before its profiles are made decent."""
         scores = (self._mixing @ self.clip(z)).astype(np.float32)
-        self._check_offset(offset)
-        logs = self._rows(cells).logs(scores, offset)
-        values: Float32 = np.ascontiguousarray(_reflectance(np, logs, out=logs).T)
-        if cells is None:
-            return values, float((self._albedo @ values).max())
-        return values, float(self._check_albedos(scores, offset).max())
+        logs: Float32 = _product(scores, self._basis)
+        logs += self.mean_
+        return logs
 
-    def _check_albedos(self, scores: Float32, offset: Float32 | None) -> Float32:
-        """Directional albedos (3, 16) of channel scores (3, m), before the energy scaling."""
-        logs = self._checked.logs(scores, offset)
-        albedo: Float32 = _product(_reflectance(np, logs, out=logs), self._check)
-        return albedo
+    def _decode(self, z: ArrayLike, offset: Float32 | None) -> tuple[Float32, float]:
+        """f (3, cells) before its energy is checked, and its greatest directional albedo."""
+        span = self._logs(z)
+        self._check_offset(offset)
+        logs: Float32 = self._profiles.keep(span)
+        if offset is not None:
+            logs += offset.T
+        values: Float32 = _reflectance(np, logs, out=logs)
+        return values, float(_product(values, self._check).max())
 
     def residual(self, brdf: TabulatedBRDF) -> Float32:
         """(cells, 3) difference of log(f + FLOOR) between a table and its encoding.
@@ -599,8 +742,7 @@ class BRDFEmbedding:
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        scores = (self._mixing @ self.clip(self.encode(table))).astype(np.float32)
-        decoded = self._every.logs(scores, None).T
+        decoded = self._profiles.keep(self._logs(self.encode(table))).T
         return np.asarray(_log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
     def body_rows(self) -> Float64:
@@ -630,6 +772,8 @@ class BRDFEmbedding:
             "n_components": np.array(self.n_components),
             "mean": self.mean_,
             "components": self.components_.astype(np.float16),
+            "share": self._profiles.share.astype(np.float16),
+            "grazing": self._profiles.grazing.astype(np.float16),
             "low": self.low_,
             "high": self.high_,
             "explained_variance_ratio": self.explained_variance_ratio_,
@@ -649,6 +793,10 @@ class BRDFEmbedding:
         result.low_ = state["low"].astype(np.float64)
         result.high_ = state["high"].astype(np.float64)
         result.explained_variance_ratio_ = state["explained_variance_ratio"].astype(np.float64)
+        allowed = (state[name].astype(np.float32) for name in ("share", "grazing"))
+        share, grazing = allowed
+        free = Profiles.none(result.grid_)
+        result._profiles = replace(free, share=share, grazing=grazing)
         result._prepare()
         return result
 
@@ -656,6 +804,55 @@ class BRDFEmbedding:
 def _log_map(values: NDArray[Any]) -> Float32:
     logs: Float32 = np.log(np.asarray(values, np.float32) + np.float32(FLOOR))
     return logs
+
+
+@functools.lru_cache(maxsize=4)
+def _exposure(grid: HalfDiffGrid) -> Float32:
+    """(cells,) what of a cell's f a sphere reflects under even light, to a factor."""
+    views = (np.arange(12) + 0.5) / 12 * math.radians(88.0)
+    share = np.sin(views) * np.cos(views)
+    return np.asarray(share @ albedo_operator(grid, views) / share.sum(), np.float32)
+
+
+@functools.lru_cache(maxsize=4)
+def _natural_light(grid: HalfDiffGrid, order: int = 12, views: int = 8) -> torch.Tensor:
+    """Rows (n, cells): what of f differs visibly on a sphere under light as it is found.
+
+    The sum of squares of the rows times a difference of f is the mean square of the difference in
+    radiance over a sphere's pixels, in the mean over maps: random ones, of no preferred direction,
+    whose power falls with the order l of the spherical harmonics as 1 / (l + 1). Real maps lie on
+    both sides of that: about 1 / l^2 without light sources, flat where a sun or a lamp is in sight
+    (Dror, Willsky & Adelson, "Statistical characterization of real-world illumination", Journal of
+    Vision 4, 2004).
+    """
+    x, share = np.polynomial.legendre.leggauss(views)
+    angles = 0.5 * (x + 1.0) * math.radians(88.0)
+    share = share * np.sin(angles) * np.cos(angles)
+    nodes = np.unique(np.append(grid.theta_h, math.pi / 2))
+    rows = []
+    for angle, part in zip(angles, share / share.sum(), strict=True):
+        th, td, pd, weight = hemisphere_nodes(float(angle), nodes, per_interval=1, azimuths=32)
+        wi, wo = from_half_diff_angles(th, td, pd)
+        azimuth = np.arctan2(wi[:, 1], wi[:, 0]) - np.arctan2(wo[:, 1], wo[:, 0])
+        polar = np.arccos(np.clip(wi[:, 2], -1.0, 1.0))
+        # azimuths of one half stand for both: of the harmonics the cosines remain
+        harmonics = np.stack(
+            [
+                math.sqrt((2.0 if m else 1.0) / (n + 1)) * sph_harm_y(n, m, polar, azimuth).real
+                for n in range(order + 1)
+                for m in range(n + 1)
+            ]
+        )
+        index, corner = grid.stencil(th, td, pd)
+        ends = np.arange(0, index.size + 1, index.shape[1])
+        shape = len(th), grid.size
+        sampled = scipy.sparse.csr_array((corner.ravel(), index.ravel(), ends), shape)
+        rows.append((sampled.T @ (harmonics * (math.sqrt(part) * weight)).T).T)
+    every = torch.from_numpy(np.concatenate(rows).astype(np.float32))
+    # few combinations carry nearly all of it
+    _, vectors = torch.linalg.eigh((every @ every.T).double())
+    kept: torch.Tensor = (vectors[:, -200:].T.float() @ every).contiguous()
+    return kept
 
 
 def _mixing(n_components: tuple[int, int]) -> Float64:
