@@ -117,7 +117,7 @@ class Profiles:
         profile = torch.arange(logs.shape[1], device=logs.device) % len(last)
         trend = logs[:, last[profile] + profile] - logs[:, profile]
         moved = logs.gather(1, cells) + extra.to(logs.dtype) * trend
-        # its slopes, and the values to the bit
+        # its slopes, and the very values
         kept_here: torch.Tensor = moved + (kept - moved).detach()
         return kept_here
 
@@ -157,7 +157,7 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any) -> Any:
             best[j], at[j] = -np.inf, 0
         for i in range(nodes - 1, -1, -1):
             for j in range(profiles):
-                v = x[c, i, j] - share[i, j] * trend[j] - grazing[i, j]
+                v = x[c, i, j] - share[i, j] * trend[j]
                 highlight = i < inner[j]
                 more = (v > best[j]) & highlight
                 best[j] = v if more else best[j]
@@ -168,13 +168,15 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any) -> Any:
             best[j] = np.inf
         for i in range(nodes):
             for j in range(profiles):
-                less = y[c, i, j] < best[j]
-                best[j] = y[c, i, j] if less else best[j]
-                at[j] = source[c, i, j] if less else at[j]
+                v, own = y[c, i, j], source[c, i, j]
+                high = v > best[j] + grazing[i, j]
+                source[c, i, j] = at[j] if high else own
+                moved = (best[j] + grazing[i, j] if high else v) + share[i, j] * trend[j]
+                less = v < best[j]
+                best[j] = v if less else best[j]
+                at[j] = own if less else at[j]
                 # what stands where it stood keeps its very bits
-                moved = best[j] + share[i, j] * trend[j] + grazing[i, j]
-                y[c, i, j] = x[c, i, j] if at[j] == i else moved
-                source[c, i, j] = at[j]
+                y[c, i, j] = x[c, i, j] if source[c, i, j] == i else moved
         for j in range(profiles):
             best[j], at[j] = -np.inf, 0
         for i in range(most - 1, -1, -1):
