@@ -1,8 +1,9 @@
 """Which embedding reaches real materials: mappings, weights, colour and dimensions compared.
 
-Every candidate is a linear space of mapped tables, fitted to the same library; measured materials
-that the library knows nothing of are encoded into it by the same robust fit, and judged by the same
-error, median |d log(f + 1e-3)| within 75 degrees of the normal.
+Every candidate is a linear space of mapped tables, or several of them side by side (charts of a
+curved manifold), fitted to the same library; measured materials that the library knows nothing of
+are encoded into it by the same robust fit, and judged by the same errors: median
+|d log(f + 1e-3)| within 75 degrees of the normal, and what a sphere of them looks like.
 """
 
 from __future__ import annotations
@@ -15,13 +16,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.cluster import KMeans
 from sklearn.utils.extmath import randomized_svd
 
 from data_gen.families import materials
 from data_gen.tables import Progress, table_of
-from traitbrdf.bench import MeasuredSet, measured_sets
-from traitbrdf.brdf import HalfDiffGrid
+from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, measured_sets
+from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.embedding import FLOOR, GRID, OPPONENT
+from traitbrdf.formats import encode_srgb
+from traitbrdf.lights import EnvironmentMap
+from traitbrdf.measured import MeasuredBRDF
+from traitbrdf.scene import Scene
+from traitbrdf.shapes import sphere
+from traitbrdf.transport import Operator
 
 Float64: TypeAlias = NDArray[np.float64]
 Float32: TypeAlias = NDArray[np.float32]
@@ -42,26 +50,30 @@ class Candidate:
     components : of each; two numbers if apart
     weight : "cosine" (square root of the lower one) or "even", of the cells above the horizon
     grid : HalfDiffGrid
+    charts : spaces side by side, each fitted to the materials of a cluster; which one is a number
     """
 
     mapping: str = "log"
     colour: str = "apart"
-    components: tuple[int, ...] = (14, 5)
+    components: tuple[int, ...] = (16, 4)
     weight: str = "cosine"
     grid: HalfDiffGrid = GRID
+    charts: int = 1
 
     @property
     def numbers(self) -> int:
         """k, of one material."""
         if self.colour == "apart":
-            return self.components[0] + 2 * self.components[1]
-        return self.components[0] * (3 if self.colour == "channel" else 1)
+            return self.components[0] + 2 * self.components[1] + (self.charts > 1)
+        return self.components[0] * (3 if self.colour == "channel" else 1) + (self.charts > 1)
 
 
 CANDIDATES: tuple[Candidate, ...] = (
     Candidate(),
-    Candidate(components=(12, 6)),
-    Candidate(components=(16, 4)),
+    Candidate(components=(14, 5)),
+    Candidate(components=(18, 3)),
+    Candidate(components=(15, 4), charts=4),
+    Candidate(components=(9, 3), charts=4),
     Candidate(colour="channel", components=(8,)),
     Candidate(colour="together", components=(24,)),
     Candidate(weight="even"),
@@ -123,22 +135,89 @@ class Space:
             parts = zip(OPPONENT, (grey, colour, colour), strict=True)
             self._design = np.concatenate([t[None, :, None] * b[:, None] for t, b in parts])
 
-    def errors(self, known: MeasuredSet) -> list[Float64]:
-        """|d log(f + FLOOR)| (3, n) of every material of a set, encoded and decoded again."""
+    def encode(self, known: MeasuredSet) -> Iterator[tuple[float, Float64, Float64]]:
+        """Of every material of a set: what the fit leaves, log(f + FLOOR) (3, n) where it was
+        given, and f (3, cells)."""
         index, corner = self.grid.stencil(*known.angles)
 
         def at(cells: Float64) -> Float64:
             return np.asarray(np.einsum("nk,...nk->...n", corner, cells[..., index]))
 
         design, mean, w, b = (at(v) for v in (self._design, self._mean, self._w, self._b))
-        found = []
+        flat = design.reshape(len(design), -1)
         for rgb in known.materials.values():
-            values = np.maximum(rgb.T, 0.0)
-            target = self._forward(values, w, b) - mean
-            z = _robust(design.reshape(len(design), -1), target.ravel())
-            shown = self._back(np.tensordot(z, design, 1) + mean, w, b)
-            found.append(np.abs(np.log(np.maximum(shown, 0.0) + FLOOR) - np.log(values + FLOOR)))
+            target = self._forward(np.maximum(rgb.T, 0.0), w, b) - mean
+            z = _robust(flat, target.ravel())
+            left = float(np.mean(np.abs(z @ flat - target.ravel())))
+            shown = np.maximum(self._back(np.tensordot(z, design, 1) + mean, w, b), 0.0)
+            whole = np.tensordot(z, self._design, 1) + self._mean
+            f = np.maximum(self._back(np.minimum(whole, 30.0), self._w, self._b), 0.0)
+            yield left, np.log(shown + FLOOR), f
+
+
+class Charts:
+    """A candidate's spaces, fitted to tables (n, 3, cells) of f: clusters of what is alike."""
+
+    def __init__(self, candidate: Candidate, tables: Float32) -> None:
+        whole = [np.ones(len(tables), bool)]
+        if candidate.charts > 1:
+            grey = np.log(tables + FLOOR).mean(axis=1)
+            scores, _, _ = randomized_svd(grey - grey.mean(axis=0), 8, random_state=0)
+            cluster = KMeans(candidate.charts, n_init=4, random_state=0).fit(scores)
+            whole = [cluster.labels_ == c for c in range(candidate.charts)]
+        self.spaces = [Space(candidate, tables[some]) for some in whole]
+
+    def encode(self, known: MeasuredSet) -> list[tuple[Float64, Float64]]:
+        """Of every material |d log(f + FLOOR)| (3, n) and f (3, cells), by its best chart."""
+        found = []
+        for rgb, fits in zip(
+            known.materials.values(), zip(*(s.encode(known) for s in self.spaces), strict=True),
+            strict=True,
+        ):  # fmt: skip
+            _, logs, f = min(fits, key=lambda fit: fit[0])
+            found.append((np.abs(logs - np.log(np.maximum(rgb.T, 0.0) + FLOOR)), f))
         return found
+
+
+class Spheres:
+    """Pictures of a sphere under some maps, of f (3, cells) on any grid."""
+
+    def __init__(self, environments: Sequence[EnvironmentMap], size: int = 64) -> None:
+        self.scenes = [Scene(sphere(), environment, size=size) for environment in environments]
+        self._operators: dict[HalfDiffGrid, list[Operator]] = {}
+
+    def images(self, grid: HalfDiffGrid, materials: Sequence[Float64]) -> list[Float64]:
+        """(B, P, 3) radiance of B materials, a map each."""
+        if grid not in self._operators:
+            self._operators = {grid: [Operator(scene, grid) for scene in self.scenes]}
+        columns = np.concatenate([f.T for f in materials], axis=1).astype(np.float32)
+        found = []
+        for operator in self._operators[grid]:
+            image = operator.part_images(0, columns).reshape(-1, 3, len(materials), 3)
+            found.append(np.einsum("pcbc->bpc", image).astype(np.float64))
+        return found
+
+    def compare(self, true: Sequence[Float64], shown: Sequence[Float64]) -> dict[str, float]:
+        """Mean linear PSNR (peak: the brightest of the image) and mean FLIP of the pictures."""
+        psnr, flips = [], []
+        for scene, every, found in zip(self.scenes, true, shown, strict=True):
+            for image, other in zip(every, found, strict=True):
+                square = float(np.mean((image - other) ** 2))
+                psnr.append(10.0 * math.log10(float(image.max()) ** 2 / max(square, 1e-20)))
+                scale = 0.8 / np.quantile(image.max(axis=1), 0.9)
+                pair = [np.zeros((scene.height * scene.width, 3)) for _ in range(2)]
+                for picture, values in zip(pair, (image, other), strict=True):
+                    picture[scene.pixels] = encode_srgb(values * scale) / 255.0
+                flips.append(_flip(*(p.reshape(scene.height, scene.width, 3) for p in pair)))
+        return {"PSNR, dB": float(np.mean(psnr)), "FLIP": float(np.mean(flips))}
+
+
+def _flip(reference: Float64, image: Float64) -> float:
+    """Mean FLIP of the pixels of two sRGB pictures (Andersson et al. 2020)."""
+    import flip_evaluator  # an optional extra
+
+    pair = (np.ascontiguousarray(p, np.float32) for p in (reference, image))
+    return float(flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)[1])
 
 
 def _loadings(rows: Any, weight: Float64, count: int) -> Float64:
@@ -181,19 +260,29 @@ def study(
 
     Yields
     ------
-    candidate, and "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL":
-    those for which there is data
+    candidate, and "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL",
+    "PSNR, dB" and "FLIP" (of the RGL materials on a sphere under three maps): those for which there
+    is data
     """
     report = progress or (lambda stage, fraction: None)
     sets = [] if data is None else measured_sets(data, 16, 6)
+    measured: list[TabulatedBRDF] = []
+    spheres = Spheres([])
+    if data is not None:
+        files = sorted((data / "rgl").glob("*.bsdf"))
+        measured = [TabulatedBRDF.from_model(MeasuredBRDF.read(path), GRID) for path in files]
+        under = [data / "envmaps" / f"{name}.exr" for name in RENDERED_UNDER]
+        spheres = Spheres([EnvironmentMap.read(path) for path in under])
     tables: dict[HalfDiffGrid, tuple[list[str], Float32]] = {}
     for done, candidate in enumerate(candidates):
         grid = candidate.grid
         if grid not in tables:
             tables = {grid: members(count, seed, grid)}
+            own = [t.regrid(grid).values.reshape(-1, 3).T.astype(np.float64) for t in measured]
+            true = spheres.images(grid, own) if own else []
         names, known = tables[grid]
         held = np.arange(count) % HELD_OUT == HELD_OUT - 1
-        space = Space(candidate, known[~held])
+        charts = Charts(candidate, known[~held])
         th, td, pd = (a[grid.above_horizon] for a in grid.node_angles())
         seen = grid.above_horizon.ravel()
         apart = {
@@ -201,29 +290,38 @@ def study(
         }
         result = {}
         for one in [MeasuredSet("held out", (th, td, pd), apart), *sets]:
-            errors = space.errors(one)
+            encoded = charts.encode(one)
+            errors = [error for error, _ in encoded]
             medians = [float(np.median(e)) for e in errors]
             result[one.name] = float(np.median(medians))
             if one.name == "MERL":
                 peak = one.angles[0] < math.radians(10.0)
                 result["MERL, 90th"] = float(np.quantile(medians, 0.9))
                 result["MERL, peak"] = float(np.median([np.median(e[:, peak]) for e in errors]))
+            if one.name == "RGL":
+                result |= spheres.compare(true, spheres.images(grid, [f for _, f in encoded]))
         report("comparing", (done + 1) / len(candidates))
         yield candidate, result
+
+
+_COLUMNS = ("mapping", "colour", "components", "k", "weight", "grid", "charts")
 
 
 def table(rows: Sequence[tuple[Candidate, dict[str, float]]]) -> str:
     """The comparison as a Markdown table."""
     names = list(rows[0][1])
     lines = [
-        "| mapping | colour | components | k | weight | grid | " + " | ".join(names) + " |",
-        "|" + "---|" * (6 + len(names)),
+        "| mapping | colour | components | k | weight | grid | charts | "
+        + " | ".join(names)
+        + " |",
+        "|" + "---|" * len([*_COLUMNS, *names]),
     ]
     for candidate, result in rows:
         parts = (
             candidate.mapping, candidate.colour, "+".join(map(str, candidate.components)),
             str(candidate.numbers), candidate.weight, "x".join(map(str, candidate.grid.shape)),
-            *(f"{result[name]:.3f}" for name in names),
+            str(candidate.charts),
+            *(f"{result[name]:.{1 if 'dB' in name else 3}f}" for name in names),
         )  # fmt: skip
         lines.append("| " + " | ".join(parts) + " |")
     return "\n".join(lines)

@@ -19,6 +19,7 @@ from traitbrdf.bench import MeasuredSet
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.embedding import GRID, BRDFEmbedding
 from traitbrdf.formats import artifact, read_arrays
+from traitbrdf.lights import EnvironmentMap
 from traitbrdf.models import GGX, Lambert, Plastic
 from traitbrdf.traits import TraitSpace
 
@@ -300,6 +301,7 @@ def test_candidates_are_told_apart():
         study.Candidate("cube root", "channel", (4,), "even", COARSE),
         study.Candidate("log-relative", "together", (12,), grid=COARSE),
         study.Candidate("log1p twice", components=(4, 2), grid=COARSE),
+        study.Candidate(components=(5, 1), grid=COARSE, charts=2),
     ]
     told = []
     rows = list(
@@ -308,11 +310,11 @@ def test_candidates_are_told_apart():
     errors = [result["held out"] for _, result in rows]
     assert errors[1] < 0.7 * errors[0]
     assert all(0.0 < e < 1.0 for e in errors)
-    assert [c.numbers for c, _ in rows] == [4, 16, 12, 12, 8]
+    assert [c.numbers for c, _ in rows] == [4, 16, 12, 12, 8, 8]
     assert told[-1] == ("comparing", 1.0)
     lines = study.table(rows).splitlines()
-    assert len(lines) == 7
-    assert f"| 8+4 | 16 | cosine | 45x12x5 | {errors[1]:.3f} |" in lines[3]
+    assert len(lines) == 8
+    assert f"| 8+4 | 16 | cosine | 45x12x5 | 1 | {errors[1]:.3f} |" in lines[3]
 
 
 def test_mappings_go_there_and_back():
@@ -330,6 +332,15 @@ def test_spaces_hold_what_they_were_fitted_to():
     seen = COARSE.above_horizon.ravel()
     angles = tuple(a.ravel()[seen] for a in COARSE.node_angles())
     one = MeasuredSet("own", angles, {"ggx": known[2][:, seen].T.astype(np.float64)})
-    space = study.Space(study.Candidate(colour="together", components=(2,), grid=COARSE), known)
-    (error,) = space.errors(one)
+    candidate = study.Candidate(colour="together", components=(2,), grid=COARSE)
+    ((error, f),) = study.Charts(candidate, known).encode(one)
     assert np.median(error) < 0.02
+    assert f.shape == (3, COARSE.size)
+    assert np.all(f >= 0.0)
+    # what looks alike is alike: the same to itself, and the less the more it is changed
+    spheres = study.Spheres([EnvironmentMap.sky(rows=16)], 16)
+    true, near, far = (spheres.images(COARSE, [c * f]) for c in (1.0, 1.05, 1.5))
+    results = [spheres.compare(true, shown) for shown in (true, near, far)]
+    psnr, flip = ([r[name] for r in results] for name in ("PSNR, dB", "FLIP"))
+    assert psnr[0] > 90.0 > psnr[1] > psnr[2]
+    assert flip[0] == 0.0 < flip[1] < flip[2] < 1.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from data_gen.families import COLOURS, FAMILIES, METALS, Material, materials
+from data_gen.spectra import SPECTRA, reflectance
 from traitbrdf.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
 from traitbrdf.models import GGX, fresnel_conductor
 
@@ -153,6 +154,44 @@ def test_metals_look_like_themselves():
     assert f0("copper")[0] > 0.9 > 0.65 > f0("copper")[2]
     assert np.ptp(f0("chrome")) < 0.1
     assert all(isinstance(m.model, GGX) for m in materials(0, 5) if m.family == "polished-metal")
+
+
+# linear Rec.709 reflectance at normal incidence as published for renderers (S. Lagarde, "Feeding a
+# physically based shading model", 2011)
+PUBLISHED = {
+    "gold": (1.022, 0.782, 0.344),
+    "silver": (0.972, 0.960, 0.915),
+    "copper": (0.955, 0.638, 0.538),
+    "aluminium": (0.913, 0.922, 0.924),
+    "chrome": (0.549, 0.556, 0.554),
+    "platinum": (0.673, 0.637, 0.585),
+    "titanium": (0.542, 0.497, 0.449),
+    "nickel": (0.660, 0.609, 0.526),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_metals_seen_by_an_observer(name):
+    """Titanium's measurements differ by sample; the others agree to 0.07."""
+    near = 0.1 if name == "titanium" else 0.07
+    np.testing.assert_allclose(reflectance(name, 1.0), PUBLISHED[name], atol=near)
+
+
+@pytest.mark.parametrize("name", SPECTRA)
+def test_indices_have_the_curve_of_the_spectrum(name):
+    """Also at angles that the fit did not see."""
+    cosines = np.linspace(0.1, 1.0, 19)
+    eta, k = (np.array(v) for v in METALS[name])
+    shown = fresnel_conductor(cosines[:, None], eta, k)
+    np.testing.assert_allclose(shown, reflectance(name, cosines), atol=0.01)
+
+
+def test_a_flat_spectrum_is_grey(monkeypatch):
+    flat = {"flat": (np.array([700.0, 400.0]), (1.5, 1.5), (2.0, 2.0))}
+    monkeypatch.setattr("data_gen.spectra.SPECTRA", flat)
+    rgb = reflectance("flat", np.array([1.0, 0.3]))
+    expected = fresnel_conductor(np.array([[1.0], [0.3]]), 1.5, 2.0)
+    np.testing.assert_allclose(rgb, np.repeat(expected, 3, axis=1), rtol=1e-9)
 
 
 def test_palette_is_physical():

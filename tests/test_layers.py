@@ -13,6 +13,7 @@ PACKAGE = ROOT / "traitbrdf"
 FLOORS = (
     ("directions", "formats"),
     ("models", "brdf", "measured", "lights", "shapes"),
+    ("profiles",),
     ("embedding", "traits", "strokes", "scene"),
     ("reference", "quadrature"),
     ("transport", "fitting"),
@@ -30,7 +31,7 @@ HOMES = {
     "sklearn": {"embedding", "traits"},
     "embreex": {"shapes"},
     "trimesh": {"shapes"},
-    "numba": {"quadrature"},
+    "numba": {"profiles", "quadrature"},
 }
 """Where else's package may be imported."""
 

@@ -654,9 +654,9 @@ class EditSession:
             if isinstance(brdf, TabulatedBRDF)
             else TabulatedBRDF.from_model(brdf, grid, name)
         )
-        z = self.embedding.clip(self.embedding.encode(table))
+        z = self.embedding.encode(table)
         values = np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
-        return Material(z, table.mirror, self.embedding.residual(table), values, name)
+        return Material(z, table.mirror, self.embedding.residual(table, z), values, name)
 
     def move(self, part: str | Iterable[str], hold: Iterable[str] = (), **amounts: float) -> None:
         """Change traits of parts: ``edit.move("handle", shiny=0.6, hold=("colour",))``.

@@ -4,8 +4,13 @@ A table's values are mapped by y = log(f + FLOOR). Matusik et al. ("A Data-Drive
 Model", SIGGRAPH 2003) take one vector of all colours for each material; here the mean of the three
 channels' logarithms and their differences (red against blue, green against magenta) are embedded
 apart, by two PCAs: materials differ in many ways in shape and in few in colour. With m = (16, 4)
-components a material has k = 24 coordinates: 14 achromatic ones first, then 5 for red against blue,
-then 5 for green against magenta; each axis is scaled to unit variance.
+components a material has k = 24 coordinates: 16 achromatic ones first, then 4 for red against blue,
+then 4 for green against magenta; each axis is scaled to unit variance.
+
+The components that PCA finds are then found anew with weights that follow the light which a cell
+reflects (weighted low-rank approximation): what is off where nothing is seen counts little. What a
+linear space holds that no material does, holes in highlights and spikes, is mended where it is
+decoded (`profiles`).
 """
 
 from __future__ import annotations
@@ -38,6 +43,7 @@ from traitbrdf.profiles import Profiles
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
 
 FLOOR = 1e-3
 """Added to f (1/sr) before the logarithm: below it a BRDF is black to the eye."""
@@ -115,7 +121,7 @@ class BRDFEmbedding:
     ----------
     n_components : (int, int)
         Components of the mean of the channels, and of each of the two colour axes: (16, 4) makes
-        14 + 2 * 5 coordinates. One number stands for both.
+        16 + 2 * 4 coordinates. One number stands for both.
 
     Attributes
     ----------
@@ -123,10 +129,11 @@ class BRDFEmbedding:
     mean_ : (cells,) float32, mean of log(f + FLOOR)
     components_ : (cells, m) float32, those of the mean of the channels first
     weight_ : (cells,) float32
-        What a cell counts in the fit: the square root of the lower cosine, 0 below the horizon.
+        What a cell counts beside its light: the square root of the lower cosine, 0 below the
+        horizon.
     low_, high_ : (k,) float64
         The gamut box: the range of the library's coordinates.
-    explained_variance_ratio_ : (m,) float64, of the whole variance
+    explained_variance_ratio_ : (m,) float64, of the whole variance, before the weights
     """
 
     def __init__(self, n_components: int | tuple[int, int] = (16, 4)) -> None:
@@ -149,7 +156,7 @@ class BRDFEmbedding:
         Parameters
         ----------
         tables : iterable of TabulatedBRDF
-            Anything but an iterator may be larger than memory: it is gone through seven times, and
+            Anything but an iterator may be larger than memory: it is gone through eleven times, and
             128 tables are held at once.
 
         Raises
@@ -322,7 +329,7 @@ class BRDFEmbedding:
         return value
 
     def encode(self, brdf: Reflectance) -> Float64:
-        """Coordinates (k,) of a table on any grid, or of a model; not clipped to the gamut.
+        """Coordinates (k,) of a table on any grid, or of a model, within the gamut box.
 
         Raises
         ------
@@ -585,7 +592,7 @@ class BRDFEmbedding:
         point = self.as_coordinates(z)
         clipped = self.clip(point)
         self._check_offset(offset)
-        logs, source, share = self._profiles.sources(self._logs(clipped))
+        logs, source, share, first = self._profiles.sources(self._logs(clipped))
         if offset is not None:
             logs += offset.T
         index = slice(None) if cells is None else self._cell_indices(cells)
@@ -595,7 +602,7 @@ class BRDFEmbedding:
         scale = 1.0 / (greatest * _MARGIN) if greatest > 1.0 else 1.0
         result = np.stack(
             [
-                self._log_slopes(c, source[c][index], share[c][index])
+                self._log_slopes(c, source[c][index], share[c][index], first[c])
                 * (slope[c][index, None] * np.float32(scale))
                 for c in range(3)
             ],
@@ -605,7 +612,7 @@ class BRDFEmbedding:
             tied = _tied(albedo)
             weight = (tied / np.float32(tied.sum())) @ self._check.T * slope
             rise = np.sum(
-                [weight[c] @ self._log_slopes(c, source[c], share[c]) for c in range(3)],
+                [weight[c] @ self._log_slopes(c, source[c], share[c], first[c]) for c in range(3)],
                 axis=0,
             )
             values = _reflectance(np, logs[:, index]) * np.float32(scale / greatest)
@@ -613,7 +620,7 @@ class BRDFEmbedding:
         result[..., point != clipped] = 0.0
         return result
 
-    def _log_slopes(self, colour: int, source: NDArray[np.int64], share: Float32) -> Float32:
+    def _log_slopes(self, colour: int, source: Int64, share: Float32, first: Int64) -> Float32:
         """d log(f + FLOOR) / d z (n, k) of one colour, at cells of which `Profiles.sources` says
         where they come from."""
         rows = self.components_.take(source, axis=0)
@@ -621,7 +628,7 @@ class BRDFEmbedding:
         if len(some):
             last = self._profiles.last
             own = source[some] % len(last)
-            trend = self.components_[last[own] * len(last) + own] - self.components_[own]
+            trend = self.components_[last[own] * len(last) + own] - self.components_[first[own]]
             rows[some] += share[some, None] * trend
         slopes: Float32 = _product(rows, self._mixing[colour].astype(np.float32))
         return slopes
@@ -735,14 +742,14 @@ class BRDFEmbedding:
         values: Float32 = _reflectance(np, logs, out=logs)
         return values, float(_product(values, self._check).max())
 
-    def residual(self, brdf: TabulatedBRDF) -> Float32:
-        """(cells, 3) difference of log(f + FLOOR) between a table and its encoding.
+    def residual(self, brdf: TabulatedBRDF, z: ArrayLike | None = None) -> Float32:
+        """(cells, 3) difference of log(f + FLOOR) between a table and its encoding, or point `z`.
 
         ``decode_values(encode(brdf), residual(brdf))`` is the table itself.
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        decoded = self._profiles.keep(self._logs(self.encode(table))).T
+        decoded = self._profiles.keep(self._logs(self.encode(table) if z is None else z)).T
         return np.asarray(_log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
     def body_rows(self) -> Float64:

@@ -4,9 +4,10 @@ A linear space of log f holds lobes with holes in them (Matusik et al. 2003 met 
 towards grazing. A profile is log f along theta_h at fixed theta_d and phi_d; every profile that
 is decoded is made to keep to what those of the library do, by little, in an order:
 
-1. The trend is what a profile rises from theta_h = 0 to the last node that both directions reach
-   (50 degrees at most), if it does: velvets do, highlights do not. A share of it is allowed at
-   every node, as early as the earliest of the library.
+1. The trend is what a profile rises from its first 10 degrees, at their brightest, to the last
+   node that both directions reach (50 degrees at most), if it does: velvets do, highlights do not,
+   with a hole or without. A share of it is allowed at every node, as early as the earliest of the
+   library.
 2. Up to `HIGHLIGHT` a profile does not rise beyond that: what lies lower than what follows is
    filled.
 3. Nowhere does it rise above its least so far by more than any member of the library: what stands
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -39,8 +40,13 @@ HIGHLIGHT = math.radians(30.0)
 
 _TALL = math.radians(80.0)
 _TREND = math.radians(50.0)
+_CORE = math.radians(10.0)
 _RISES = 0.1
 """Trends below this (in log f) do not say what shares of a trend the library has."""
+
+_EARLY = 0.7
+"""The most of its trend that a profile may rise in its first 10 degrees: models of sheen have a
+dark point in the middle that no cloth has."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +55,18 @@ class Profiles:
 
     Parameters
     ----------
-    share : (n_theta_h, n) float32 in [0, 1], the share of its trend that a profile may have risen
+    share : (n_theta_h, n) float32 in [0, 1.7], the share of its trend that a profile may have risen
     grazing : (n_theta_h, n) float32, the rise in log f that is allowed beyond that
     inner : (n,) int32, how many of the first nodes belong to the highlight
     last : (n,) int32, the node at which the trend is read
+    core : how many of the first nodes it is counted from
     """
 
     share: Float32
     grazing: Float32
     inner: Int32
     last: Int32
+    core: int
 
     @classmethod
     def none(cls, grid: HalfDiffGrid) -> Profiles:
@@ -76,13 +84,14 @@ class Profiles:
             np.zeros_like(share),
             np.where(tall, inner, 0).astype(np.int32),
             last.astype(np.int32),
+            int(np.sum(grid.theta_h <= _CORE)),
         )
 
     @classmethod
     def of(cls, logs: Callable[[], Iterator[Float32]], grid: HalfDiffGrid) -> Profiles:
         """Those of a library, gone through twice in batches of log f (n, 3, cells).
 
-        No member is changed but for valleys in its highlight.
+        No member is changed but for valleys in its highlight, and dark points in its middle.
         """
         free = cls.none(grid)
         share, grazing = free.share.copy(), free.grazing.copy()
@@ -92,18 +101,20 @@ class Profiles:
             trend = free._trend(x)
             rise = np.where(trend > _RISES, (x - x[:, :1]) / np.maximum(trend, _RISES), 0.0)
             np.maximum(share, rise.max(axis=0), out=share)
-        share = np.maximum.accumulate(np.minimum(share, 1.0), axis=0)
+        share = np.minimum(share, np.where(nodes < free.core, _EARLY, 1.0 + _EARLY))
+        share = np.maximum.accumulate(share.astype(np.float32), axis=0)
         for batch in logs():
             x = batch.reshape(-1, *share.shape)
             x = x - share * free._trend(x)
             rise = (x - np.minimum.accumulate(x, axis=1)).max(axis=0)
             np.maximum(grazing, rise, out=grazing)
         grazing = np.where(nodes >= np.maximum(free.inner, 1), grazing, np.float32(0.0))
-        return cls(share, np.maximum.accumulate(grazing, axis=0), free.inner, free.last)
+        return replace(free, share=share, grazing=np.maximum.accumulate(grazing, axis=0))
 
     def _trend(self, x: Float32) -> Float32:
         """(..., 1, n) of profiles (..., n_theta_h, n)."""
-        rise = x[..., self.last, np.arange(len(self.last))] - x[..., 0, :]
+        first = x[..., : self.core, :].max(axis=-2)
+        rise = x[..., self.last, np.arange(len(self.last))] - first
         trend: Float32 = np.maximum(rise, 0.0)[..., None, :]
         return trend
 
@@ -112,16 +123,18 @@ class Profiles:
         if not isinstance(logs, torch.Tensor):
             return self.sources(logs)[0]
         found = self.sources(logs.detach().cpu().numpy())
-        kept, cells, extra = (torch.from_numpy(v).to(logs.device) for v in found)
+        kept, cells, extra, first = (torch.from_numpy(v).to(logs.device) for v in found)
         last = torch.from_numpy(self.last.astype(np.int64)).to(logs.device) * len(self.last)
         profile = torch.arange(logs.shape[1], device=logs.device) % len(last)
-        trend = logs[:, last[profile] + profile] - logs[:, profile]
+        trend = logs[:, last[profile] + profile] - logs.gather(1, first[:, profile])
         moved = logs.gather(1, cells) + extra.to(logs.dtype) * trend
         # its slopes, and the very values
         kept_here: torch.Tensor = moved + (kept - moved).detach()
         return kept_here
 
-    def sources(self, logs: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64], Float32]:
+    def sources(
+        self, logs: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[np.int64], Float32, NDArray[np.int64]]:
         """log f (3, cells) that keeps to it, and where it comes from.
 
         Returns
@@ -131,16 +144,20 @@ class Profiles:
             The cell of the same profile and colour whose value is taken.
         extra : (3, cells) float32
             How much of the profile's trend comes on top, where it has one; 0 elsewhere.
+        first : (3, n) int64
+            The cell that each profile's trend is counted from.
         """
         x = np.ascontiguousarray(logs).reshape(3, *self.share.shape)
-        kept, node, extra = _keep(x, self.share, self.grazing, self.inner, self.last)
-        cells = node.astype(np.int64) * len(self.last) + np.arange(len(self.last))
-        return kept.reshape(3, -1), cells.reshape(3, -1), extra.reshape(3, -1)
+        allowed = self.share, self.grazing, self.inner, self.last, self.core
+        kept, node, extra, top = _keep(x, *allowed)
+        profile = np.arange(len(self.last))
+        cells, first = (n.astype(np.int64) * len(profile) + profile for n in (node, top))
+        return kept.reshape(3, -1), cells.reshape(3, -1), extra.reshape(3, -1), first
 
 
 @numba.njit(cache=True, nogil=True)
-def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any) -> Any:
-    """Values, source nodes and extra shares of the trend; x (3, nodes, profiles).
+def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any, core: Any) -> Any:
+    """Values, source nodes, extra shares of the trend, its first nodes; x (3, nodes, profiles).
 
     Rows are gone through whole, so that the profiles of a row are done at once.
     """
@@ -148,12 +165,16 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any) -> Any:
     y, source = np.empty_like(x), np.empty(x.shape, np.int32)
     extra = np.zeros(x.shape, np.float32)
     best, at = np.empty(profiles, x.dtype), np.empty(profiles, np.int32)
-    trend = np.empty(profiles, x.dtype)
+    trend, top = np.empty(profiles, x.dtype), np.empty((colours, profiles), np.int32)
     most = inner.max()
     rim, place = np.empty((most, profiles), x.dtype), np.empty((most, profiles), np.int32)
     for c in range(colours):
         for j in range(profiles):
-            trend[j] = max(x[c, last[j], j] - x[c, 0, j], 0.0)
+            top[c, j] = 0
+            for i in range(1, core):
+                if x[c, i, j] > x[c, top[c, j], j]:
+                    top[c, j] = i
+            trend[j] = max(x[c, last[j], j] - x[c, top[c, j], j], 0.0)
             best[j], at[j] = -np.inf, 0
         for i in range(nodes - 1, -1, -1):
             for j in range(profiles):
@@ -210,4 +231,4 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any) -> Any:
                 place[i, j] = source[c, place[i, j], j]
             for i in range(inner[j]):
                 source[c, i, j] = place[i, j]
-    return y, source, extra
+    return y, source, extra, top
