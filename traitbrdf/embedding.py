@@ -358,7 +358,8 @@ class BRDFEmbedding:
         light = _natural_light(self.grid_)
         given = torch.from_numpy(np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0))
         seen = light @ given.T
-        precision = 1.0 / (_SEEN**2 * max(float((seen**2).sum()), 1e-30))
+        black = light @ torch.full((self.grid_.size, 3), FLOOR)  # no more matters of what is black
+        precision = 1.0 / (_SEEN**2 * float((seen**2 + black**2).sum()))
 
         def misfit(z: Float64) -> tuple[float, Float32, Any]:
             shown = self.decode_values(z)
