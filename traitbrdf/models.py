@@ -27,7 +27,6 @@ from functools import cached_property
 from typing import Any, ClassVar, TypeAlias, cast
 
 import numpy as np
-import scipy.integrate
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import as_directions
@@ -570,7 +569,9 @@ class _HalfVectorLobe(_Lobe):
         log_theta = np.linspace(math.log(1e-7), math.log(0.5 * math.pi), 8193)
         theta = np.exp(log_theta)
         ring = self._shape(np.sin(theta) ** 2) * np.sin(theta) * theta
-        return 2.0 * math.pi * float(scipy.integrate.simpson(ring, x=log_theta))
+        from scipy.integrate import simpson  # a third of a second to import
+
+        return 2.0 * math.pi * float(simpson(ring, x=log_theta))
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Float64:
         pair = _Pair(wi, wo)
