@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.tables import Progress, Tables
-from traitbrdf.embedding import FLOOR, GRID, BRDFEmbedding
+from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
 from traitbrdf.traits import TraitSpace
 
 COUNT = 2040
@@ -54,8 +54,7 @@ def build(
     embedding = BRDFEmbedding.from_arrays(embedding.fit(tables).arrays())
     encoded, rows = [], []
     for table in tables:
-        logs = np.log(table.values.reshape(1, -1, 3) + np.float32(FLOOR)).transpose(0, 2, 1)
-        encoded.append(embedding.least_squares(logs)[0])
+        encoded.append(embedding.least_squares(channel_logs(table)[None])[0])
         rows.append(descriptors(table))
     coordinates = np.stack(encoded).astype(np.float32)
     embedding.low_ = coordinates.min(axis=0).astype(np.float64)

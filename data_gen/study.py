@@ -21,7 +21,7 @@ from sklearn.utils.extmath import randomized_svd
 
 from data_gen.families import materials
 from data_gen.tables import Progress, table_of
-from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, measured_sets
+from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.embedding import FLOOR, GRID, OPPONENT
 from traitbrdf.formats import encode_srgb
@@ -203,7 +203,7 @@ class Spheres:
         for scene, every, found in zip(self.scenes, true, shown, strict=True):
             for image, other in zip(every, found, strict=True):
                 square = float(np.mean((image - other) ** 2))
-                psnr.append(10.0 * math.log10(float(image.max()) ** 2 / max(square, 1e-20)))
+                psnr.append(decibels(float(image.max()), square))
                 scale = 0.8 / np.quantile(image.max(axis=1), 0.9)
                 pair = [np.zeros((scene.height * scene.width, 3)) for _ in range(2)]
                 for picture, values in zip(pair, (image, other), strict=True):

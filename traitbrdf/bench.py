@@ -750,15 +750,16 @@ def spheres_compared(
         operator = Operator(Scene(sphere(), environment, size=size), tables[0].grid)
         images = _own_colours(operator.part_images(0, _channels([*tables, *shown])))
         for i, (true, found) in enumerate(zip(*np.split(images.swapaxes(0, 1), 2), strict=True)):
-            linear[m, i] = _decibels(float(true.max()), float(np.mean((true - found) ** 2)))
+            linear[m, i] = decibels(float(true.max()), float(np.mean((true - found) ** 2)))
             scale = 0.8 / np.quantile(true.max(axis=1), 0.9)
             clipped = np.clip([true * scale, found * scale], 0.0, 1.0)
-            exposed[m, i] = _decibels(1.0, float(np.mean((clipped[0] - clipped[1]) ** 2)))
+            exposed[m, i] = decibels(1.0, float(np.mean((clipped[0] - clipped[1]) ** 2)))
             error[m, i] = reference.relative_error(found, true)
     return linear, exposed, error
 
 
-def _decibels(peak: float, square: float) -> float:
+def decibels(peak: float, square: float) -> float:
+    """PSNR of a mean squared difference."""
     return 10.0 * math.log10(peak**2 / max(square, 1e-20))
 
 

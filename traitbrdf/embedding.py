@@ -343,7 +343,7 @@ class BRDFEmbedding:
             table = brdf.regrid(self.grid_)
         else:
             table = TabulatedBRDF.from_model(brdf, self.grid_)
-        logs = np.ascontiguousarray(_log_map(table.values).reshape(-1, 3).T)
+        logs = np.ascontiguousarray(channel_logs(table))
         weight = np.repeat(self.weight_[None].astype(np.float64) ** 2, 3, axis=0)
         weight *= 3.0 * 1000.0 / _NOISE**2 / weight.sum()
         return self._refined(self.clip(self.least_squares(logs[None])[0]), logs, weight)
@@ -361,20 +361,19 @@ class BRDFEmbedding:
         black = light @ torch.full((self.grid_.size, 3), FLOOR)  # no more matters of what is black
         precision = 1.0 / (_SEEN**2 * float((seen**2 + black**2).sum()))
 
-        def misfit(z: Float64) -> tuple[float, Float32, Any]:
+        def misfit(z: Float64) -> tuple[float, Float32, Float32, Any]:
             shown = self.decode_values(z)
             away = _log_map(shown).T - logs
             robust = np.minimum(np.abs(away), _ROBUST)
             cost = float(np.sum(weight * robust * (np.abs(away) - 0.5 * robust)))
             apart = light @ torch.from_numpy(shown) - seen
             cost += 0.5 * precision * float((apart**2).sum()) + 0.5 * _PRIOR * float(z @ z)
-            return cost, away, apart
+            return cost, shown, away, apart
 
         z, damping = start, 1e-3
-        cost, away, apart = misfit(z)
+        cost, shown, away, apart = misfit(z)
         for _ in range(_ROUNDS):
             slopes = self.jacobian(z)
-            shown = self.decode_values(z)
             gram, pull = _PRIOR * np.eye(self.size), _PRIOR * z
             count = (weight * _ROBUST / np.maximum(np.abs(away), _ROBUST)).astype(np.float32)
             for colour in range(3):
@@ -395,7 +394,7 @@ class BRDFEmbedding:
                 moved = self.clip(z + step)
                 trial = misfit(moved)
                 if trial[0] < cost:
-                    z, (cost, away, apart) = moved, trial
+                    z, (cost, shown, away, apart) = moved, trial
                     damping = max(0.2 * damping, 1e-6)
                     break
                 damping *= 8.0
@@ -801,12 +800,18 @@ class BRDFEmbedding:
         result.low_ = state["low"].astype(np.float64)
         result.high_ = state["high"].astype(np.float64)
         result.explained_variance_ratio_ = state["explained_variance_ratio"].astype(np.float64)
-        allowed = (state[name].astype(np.float32) for name in ("share", "grazing"))
-        share, grazing = allowed
-        free = Profiles.none(result.grid_)
-        result._profiles = replace(free, share=share, grazing=grazing)
+        result._profiles = replace(
+            Profiles.none(result.grid_),
+            share=state["share"].astype(np.float32),
+            grazing=state["grazing"].astype(np.float32),
+        )
         result._prepare()
         return result
+
+
+def channel_logs(table: TabulatedBRDF) -> Float32:
+    """log(f + FLOOR) (3, cells) of a table."""
+    return _log_map(table.values).reshape(-1, 3).T
 
 
 def _log_map(values: NDArray[Any]) -> Float32:
@@ -895,7 +900,7 @@ def _batches(tables: Iterable[TabulatedBRDF]) -> Iterator[Float32]:
     """log(f + FLOOR) (n, 3, cells) of some tables at a time."""
     waiting: list[Float32] = []
     for table in tables:
-        waiting.append(_log_map(table.values).reshape(-1, 3).T)
+        waiting.append(channel_logs(table))
         if len(waiting) == _BATCH:
             yield np.stack(waiting)
             waiting.clear()
