@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data_gen.families import materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.tables import Progress, Tables
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
@@ -70,6 +72,10 @@ def build(
         **space.arrays(),
         "names": np.array(tables.names),
         "families": np.array(tables.families),
+        "parameters": np.array([json.dumps(m.parameters) for m in materials(seed, count)]),
+        "seed": np.array(seed, np.int64),
         "coordinates": coordinates,
+        "descriptor_names": np.array(list(rows[0])),
+        "descriptors": np.array([list(row.values()) for row in rows], np.float32),
         "labels": np.stack([marks[name] for name in space.names]),
     }

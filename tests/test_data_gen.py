@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -15,9 +16,10 @@ from data_gen import packing, study, tables
 from data_gen.families import FAMILIES, materials
 from data_gen.labels import descriptors, labels, trait_values
 from data_gen.packing import build
+from data_gen.tables import table_of
 from traitbrdf.bench import MeasuredSet
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.embedding import GRID, BRDFEmbedding
+from traitbrdf.embedding import GRID, BRDFEmbedding, default_library
 from traitbrdf.formats import artifact, read_arrays
 from traitbrdf.lights import EnvironmentMap
 from traitbrdf.models import GGX, Lambert, Plastic
@@ -61,6 +63,13 @@ def test_what_the_package_ships():
     recipe = list(materials(packing.SEED, count))
     assert [m.name for m in recipe] == shipped["names"].tolist()
     assert [m.family for m in recipe] == shipped["families"].tolist()
+    assert int(shipped["seed"]) == packing.SEED
+    library = default_library()
+    assert [json.dumps(m.parameters) for m in recipe] == [json.dumps(p) for p in library.parameters]
+    for i in range(0, count, 170):  # descriptors are those of the members' own tables
+        mine = descriptors(table_of(recipe[i], GRID))
+        kept = {name: column[i] for name, column in library.descriptors.items()}
+        assert kept == pytest.approx(mine, rel=1e-5, abs=1e-6)
     for row in shipped["labels"]:  # a third has it, a third has it not
         assert abs(np.mean(row == 1) - 1 / 3) < 0.01
         assert abs(np.mean(row == -1) - 1 / 3) < 0.01

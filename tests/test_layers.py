@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -155,8 +157,26 @@ def test_public_names_are_few_and_listed():
     assert len(names) == len(set(names)) <= 25
     bound = {
         alias.asname or alias.name
-        for node in tree.body
+        for node in ast.walk(tree)
         if isinstance(node, ast.Import | ast.ImportFrom)
         for alias in node.names
     } | {t.id for node in tree.body if isinstance(node, ast.Assign) for t in node.targets}
     assert set(names) <= bound
+
+
+def test_materials_and_traits_do_not_wait_for_torch():
+    code = (
+        "import sys, traitbrdf as tb\n"
+        "z = tb.default_library().coordinates[0]\n"
+        "tb.default_traits().move(tb.default_embedding().clip(z), {'shiny': 0.1})\n"
+        "assert not {'torch', 'sklearn'} & set(sys.modules)\n"
+        "assert tb.EditSession is tb.EditSession and 'torch' in sys.modules\n"
+        "from traitbrdf.studio import session\n"
+        "assert callable(tb.studio)\n"
+        "try:\n    tb.nothing\nexcept AttributeError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "module 'traitbrdf' has no attribute 'nothing'\n"
+    names = subprocess.run([sys.executable, "-c", "from traitbrdf import *; EditSession; teapot()"])
+    assert names.returncode == 0

@@ -4,11 +4,12 @@ Materials of a shape's parts are edited by painting or moving traits ("shiny", "
 rendered at once under real light; what comes out is a real, tabulated BRDF.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from traitbrdf import models as models
 from traitbrdf import reference as reference
 from traitbrdf.brdf import HalfDiffGrid as HalfDiffGrid
 from traitbrdf.brdf import TabulatedBRDF as TabulatedBRDF
-from traitbrdf.editing import EditSession as EditSession
 from traitbrdf.embedding import BRDFEmbedding as BRDFEmbedding
 from traitbrdf.embedding import Library as Library
 from traitbrdf.embedding import default_embedding as default_embedding
@@ -27,6 +28,9 @@ from traitbrdf.strokes import Stroke as Stroke
 from traitbrdf.studio import studio as studio
 from traitbrdf.traits import TraitSpace as TraitSpace
 from traitbrdf.traits import default_traits as default_traits
+
+if TYPE_CHECKING:
+    from traitbrdf.editing import EditSession as EditSession
 
 __version__ = "0.1.0"
 
@@ -55,3 +59,14 @@ __all__ = [
     "studio",
     "teapot",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Sessions are loaded when first asked for: torch and the compiled loops take a second, which
+    materials and traits need not wait for."""
+    if name == "EditSession":
+        from traitbrdf.editing import EditSession
+
+        globals()[name] = EditSession
+        return EditSession
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

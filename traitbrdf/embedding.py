@@ -16,16 +16,16 @@ decoded (`profiles`).
 from __future__ import annotations
 
 import functools
+import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 import scipy.optimize
 import scipy.sparse
 import scipy.spatial
-import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import sph_harm_y
 
@@ -40,6 +40,9 @@ from traitbrdf.brdf import (
 from traitbrdf.directions import fold_phi_d, from_half_diff_angles
 from traitbrdf.formats import artifact, unknown_name
 from traitbrdf.profiles import Profiles
+
+if TYPE_CHECKING:  # where it is needed it is imported: it takes a second
+    import torch
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -98,6 +101,8 @@ _TIE = 1e-6
 def _product(a: Any, b: Any) -> Any:
     """a @ b of arrays or tensors, by torch: numpy's threads spin for milliseconds after a product,
     and those of the next one, which is torch's, wait for the same cores."""
+    import torch
+
     if isinstance(a, torch.Tensor):
         return a @ b
     return torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
@@ -199,6 +204,8 @@ class BRDFEmbedding:
         Weighted low-rank approximation by alternating least squares (Srebro & Jaakkola, "Weighted
         Low-Rank Approximations", ICML 2003, section 3).
         """
+        import torch
+
         size = self.components_.shape[1] + 1
         upper = np.triu_indices(size)
         gram = torch.zeros((len(upper[0]), self.grid_.size), dtype=torch.float64)
@@ -241,6 +248,8 @@ class BRDFEmbedding:
 
         Weighted by the light that a cell reflects, neither robust nor clipped to the gamut.
         """
+        import torch
+
         components = torch.from_numpy(self.components_)
         found = np.empty((len(logs), self.size))
         for i, (weights, target) in enumerate(zip(self._fit_weight(logs), logs, strict=True)):
@@ -355,6 +364,8 @@ class BRDFEmbedding:
         deviations of what is seen under light as it is found (`_natural_light`), relative to all
         of it, by `_SEEN`. Levenberg and Marquardt's steps, within the box.
         """
+        import torch
+
         light = _natural_light(self.grid_)
         given = torch.from_numpy(np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0))
         seen = light @ given.T
@@ -662,6 +673,8 @@ class BRDFEmbedding:
         ValueError
             On a wrong shape or precision, or an index outside the grid.
         """
+        import torch
+
         self._fitted()
         if z.shape != (self.size,):
             raise ValueError(f"z: expected shape ({self.size},), got {tuple(z.shape)}")
@@ -688,6 +701,8 @@ class BRDFEmbedding:
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> _Tensors:
         """The fitted state as tensors, kept: 2 MB in float32 for the default embedding."""
+        import torch
+
         key = (device, dtype)
         if key not in self._tensors:
 
@@ -838,6 +853,8 @@ def _natural_light(grid: HalfDiffGrid, order: int = 12, views: int = 8) -> torch
     (Dror, Willsky & Adelson, "Statistical characterization of real-world illumination", Journal of
     Vision 4, 2004).
     """
+    import torch
+
     x, share = np.polynomial.legendre.leggauss(views)
     angles = 0.5 * (x + 1.0) * math.radians(88.0)
     share = share * np.sin(angles) * np.cos(angles)
@@ -936,6 +953,11 @@ class Library:
     ----------
     names, families : tuples of str
     coordinates : (n, k) float64
+    parameters : tuple of mappings
+        What the recipe of a member's family was given, by name: numbers, and colours as lists of
+        three; empty where unknown. With the recipe's seed they are what `data_gen` draws.
+    descriptors : dict of (n,) float64
+        Physical descriptors of each member's own table, by name (`data_gen/labels.py`).
     """
 
     def __init__(
@@ -944,6 +966,8 @@ class Library:
         names: Sequence[str],
         coordinates: ArrayLike,
         families: Sequence[str],
+        parameters: Sequence[Mapping[str, Any]] | None = None,
+        descriptors: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         self.embedding = embedding
         self.names = tuple(names)
@@ -954,6 +978,18 @@ class Library:
                 f"coordinates: expected shape {(len(self.names), embedding.size)}, "
                 f"got {self.coordinates.shape}"
             )
+        self.parameters = tuple(parameters) if parameters is not None else ({},) * len(self.names)
+        if len(self.parameters) != len(self.names):
+            raise ValueError(
+                f"parameters: expected {len(self.names)} of them, got {len(self.parameters)}"
+            )
+        self.descriptors = {k: np.asarray(v, np.float64) for k, v in (descriptors or {}).items()}
+        for name, column in self.descriptors.items():
+            if column.shape != (len(self.names),):
+                raise ValueError(
+                    f"descriptors: expected ({len(self.names)},) values of {name!r}, "
+                    f"got shape {column.shape}"
+                )
         self._index = {name: i for i, name in enumerate(self.names)}
 
     def __len__(self) -> int:
@@ -1002,4 +1038,6 @@ def default_library() -> Library:
         [str(n) for n in state["names"]],
         state["coordinates"],
         [str(f) for f in state["families"]],
+        [json.loads(str(text)) for text in state["parameters"]],
+        dict(zip(state["descriptor_names"].tolist(), state["descriptors"].T, strict=True)),
     )

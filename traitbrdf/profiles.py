@@ -27,7 +27,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from traitbrdf.brdf import HalfDiffGrid
@@ -120,8 +119,10 @@ class Profiles:
 
     def keep(self, logs: Any) -> Any:
         """log f (3, cells) that keeps to it: a tensor of a tensor (differentiable), else arrays."""
-        if not isinstance(logs, torch.Tensor):
+        if isinstance(logs, np.ndarray):
             return self.sources(logs)[0]
+        import torch  # it takes a second, which arrays need not wait for
+
         found = self.sources(logs.detach().cpu().numpy())
         kept, cells, extra, first = (torch.from_numpy(v).to(logs.device) for v in found)
         last = torch.from_numpy(self.last.astype(np.int64)).to(logs.device) * len(self.last)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traitbrdf.editing import EditSession
-
 if TYPE_CHECKING:
+    from traitbrdf.editing import EditSession
     from traitbrdf.studio.widget import Canvas
 
 
@@ -27,7 +26,8 @@ def studio(edit: EditSession) -> Canvas:
     -------
     anywidget.AnyWidget, with the session as ``.session``
     """
-    # a notebook's packages take longer to import than all of this one
+    # a notebook's packages take longer to import than all of this one, and so does torch
+    from traitbrdf.editing import EditSession
     from traitbrdf.studio.widget import Canvas
 
     if not isinstance(edit, EditSession):
