@@ -1,98 +1,160 @@
-"""Labels of library members, from physical descriptors of their tables.
+"""Traits: what each means, and labels of library members from descriptors of their tables.
 
-Never from the parameters of the recipes: what a table looks like decides, so that a measured
-material would get the same label.
+Never from the parameters of the recipes, and never from ratings: what a table looks like decides,
+so that a measured material would get the same label. A trait's grade is a mean (or, where it takes
+all of several things at once, the least) of ranks of descriptors among the members; ranks make
+descriptors of different units comparable. Names are the 16 of Matusik et al. 2003 and the 14 of
+Serrano et al. 2016, and "shiny".
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from traitbrdf.brdf import TabulatedBRDF
-
 Float64 = NDArray[np.float64]
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709 luminance of linear RGB."""
+Ranks = Mapping[str, Float64]
 
 SHARE = 1.0 / 3.0
-"""Members in the upper third of a trait's descriptor have it, in the lower third have it not."""
+"""Members in the upper third of a trait's grade have it, in the lower third have it not."""
 
 
-def descriptors(brdf: TabulatedBRDF) -> dict[str, float]:
-    """Physical descriptors of one table.
+class Definition(NamedTuple):
+    """A trait: what it means in a line, everyday names, its descriptors, and its grade.
 
-    Returns
-    -------
-    dict with
-
-    - ``highlight``: difference of the cube roots of highlight and body radiance factor: contrast
-      gloss on a perceptual scale (Hunter 1937; Pellacini et al. 2000, who use the cube root).
-    - ``width``: log of theta_h (radians) at which the lobe falls half way from peak to body.
-    - ``lightness``: cube root of the luminous albedo at 30 degrees (CIE lightness).
-    - ``specular``, ``diffuse``: luminous albedo of the lobe and of the body at 30 degrees.
-    - ``tint``: chroma of the highlight, the standard deviation of its log RGB.
-    - ``red``, ``green``, ``blue``: log of that channel's albedo over the mean of the others'.
+    `grade` gets the rank in [0, 1] of every descriptor among the members.
     """
-    grid = brdf.grid
-    values = np.asarray(brdf.values, np.float64)
-    incidence = (grid.theta_d > math.radians(15.0)) & (grid.theta_d < math.radians(50.0))
-    body_h = (grid.theta_h > math.radians(35.0)) & (grid.theta_h < math.radians(50.0))
-    near = (grid.theta_d > math.radians(2.0)) & (grid.theta_d < math.radians(25.0))
-    profile = values[:, incidence].mean(axis=(1, 2))  # (n_theta_h, 3)
-    body = values[body_h][:, near].min(axis=(0, 1, 2))
-    peak = profile[0]
-    light_profile = profile @ LUMINANCE
-    light_body = float(body @ LUMINANCE)
-    light_peak = float(light_profile[0])
-    half = light_body + 0.5 * (light_peak - light_body)
-    below = np.flatnonzero(light_profile <= half)
-    i = int(below[0]) if len(below) and below[0] > 0 else len(light_profile) - 1
-    upper, lower = light_profile[i - 1], light_profile[i]
-    part = (upper - half) / (upper - lower) if upper > lower else 1.0
-    width = grid.theta_h[i - 1] + part * (grid.theta_h[i] - grid.theta_h[i - 1])
-    if light_peak < 1.2 * light_body:  # no lobe stands out: as wide as the hemisphere
-        width = math.pi / 4
-    albedo = np.maximum(brdf.albedo(math.radians(30.0)), 1e-4)
-    logs = np.log(albedo)
-    diffuse = math.pi * light_body
-    lobe = np.log(np.maximum(peak - body, 1e-4))
-    return {
-        "highlight": math.pi ** (1 / 3) * (np.cbrt(light_peak) - np.cbrt(light_body)),
-        "width": math.log(max(float(width), 1e-4)),
-        "lightness": float(np.cbrt(albedo @ LUMINANCE)),
-        "specular": max(float(albedo @ LUMINANCE) - diffuse, 0.0),
-        "diffuse": diffuse,
-        "tint": float(lobe.std()),
-        "red": float(logs[0] - logs[[1, 2]].mean()),
-        "green": float(logs[1] - logs[[0, 2]].mean()),
-        "blue": float(logs[2] - logs[[0, 1]].mean()),
+
+    meaning: str
+    synonyms: tuple[str, ...]
+    descriptors: tuple[str, ...]
+    grade: Callable[[Ranks], Float64]
+
+
+def _metallic(r: Ranks) -> Float64:
+    return 0.5 * r["highlight"] + 0.5 * r["reflection"]
+
+
+TRAITS: Mapping[str, Definition] = MappingProxyType(
+    {
+        "shiny": Definition(
+            "bright, clear highlights", ("lustrous", "polished"), ("highlight", "gloss_60"),
+            lambda r: 0.5 * r["highlight"] + 0.5 * r["gloss_60"],
+        ),
+        "glossy": Definition(
+            "highlights that stand out from what lies below", ("glossiness", "gloss"),
+            ("highlight",), lambda r: r["highlight"],
+        ),
+        "matte": Definition(
+            "no highlight stands out", ("flat", "dull"), ("highlight",),
+            lambda r: 1.0 - r["highlight"],
+        ),
+        "strength": Definition(
+            "how strong reflections are", ("reflective", "refstrng"), ("highlight", "specular"),
+            lambda r: 0.7 * r["highlight"] + 0.3 * r["specular"],
+        ),
+        "sharpness": Definition(
+            "how sharply surroundings are mirrored", ("sharp", "refsharp", "mirror-like"),
+            ("highlight", "width"), lambda r: 0.5 * r["highlight"] + 0.5 * (1.0 - r["width"]),
+        ),
+        "tint": Definition(
+            "colour of the reflections", ("tinted", "reftint"), ("tint",), lambda r: r["tint"],
+        ),
+        "specular": Definition(
+            "how much light leaves as reflection", ("specularness",), ("specular",),
+            lambda r: r["specular"],
+        ),
+        "diffuse": Definition(
+            "how much light leaves scattered from the body", ("diffuseness",), ("diffuse",),
+            lambda r: r["diffuse"],
+        ),
+        "metallic": Definition(
+            "all light leaves as a strong reflection", ("metal", "metallic-like"),
+            ("highlight", "specular", "diffuse"), _metallic,
+        ),
+        "silver": Definition(
+            "a light, colourless metal", ("silvery", "silverness"),
+            ("highlight", "specular", "diffuse", "tint", "lightness"),
+            lambda r: np.minimum.reduce([_metallic(r), 1.0 - r["tint"], r["lightness"]]),
+        ),
+        "gold": Definition(
+            "a metal of the colour of gold", ("golden", "gold-like"),
+            ("highlight", "specular", "diffuse", "gold"),
+            lambda r: np.minimum(_metallic(r), r["gold"]),
+        ),
+        "plastic": Definition(
+            "a clear colourless highlight over a body", ("plastic-like",),
+            ("highlight", "diffuse", "tint"),
+            lambda r: np.minimum.reduce([r["highlight"], r["diffuse"], 1.0 - r["tint"]]),
+        ),
+        "acrylic": Definition(
+            "a sharp colourless highlight over a saturated body", ("acrylic-like", "lacquered"),
+            ("width", "diffuse_chroma", "tint"),
+            lambda r: np.minimum.reduce([1.0 - r["width"], r["diffuse_chroma"], 1.0 - r["tint"]]),
+        ),
+        "ceramic": Definition(
+            "a sharp colourless highlight over a light body", ("porcelain", "glazed"),
+            ("width", "diffuse", "tint"),
+            lambda r: np.minimum.reduce([1.0 - r["width"], r["diffuse"], 1.0 - r["tint"]]),
+        ),
+        "rubber": Definition(
+            "a dull dark surface", ("rubbery", "rubber-like"), ("highlight", "lightness"),
+            lambda r: 0.8 * (1.0 - r["highlight"]) + 0.2 * (1.0 - r["lightness"]),
+        ),
+        "fabric": Definition(
+            "no highlight, and light edges", ("cloth", "fabric-like"), ("highlight", "sheen"),
+            lambda r: 0.7 * (1.0 - r["highlight"]) + 0.3 * r["sheen"],
+        ),
+        "soft": Definition(
+            "looks soft to the touch: hardly a highlight, light edges", (), ("highlight", "sheen"),
+            lambda r: 0.8 * (1.0 - r["highlight"]) + 0.2 * r["sheen"],
+        ),
+        "hard": Definition(
+            "looks hard to the touch: strong, narrow highlights", ("solid",),
+            ("highlight", "width"), lambda r: 0.7 * r["highlight"] + 0.3 * (1.0 - r["width"]),
+        ),
+        "rough": Definition(
+            "wide, weak highlights", ("roughness", "coarse"), ("highlight", "width"),
+            lambda r: 0.5 * (1.0 - r["highlight"]) + 0.5 * r["width"],
+        ),
+        "greasy": Definition(
+            "strong highlights with a haze around them", ("oily", "greasiness"),
+            ("highlight", "haze"), lambda r: np.minimum(r["highlight"], r["haze"]),
+        ),
+        "dusty": Definition(
+            "dull and pale, with light edges", ("dustiness", "powdery"),
+            ("highlight", "sheen", "diffuse_chroma"),
+            lambda r: (1.0 - r["highlight"] + r["sheen"] + 1.0 - r["diffuse_chroma"]) / 3.0,
+        ),
+        "bright": Definition(
+            "how light it is", ("light", "brightness"), ("body_lightness",),
+            lambda r: r["body_lightness"],
+        ),
+        "red": Definition("more red than the other colours", ("redness",), ("red",),
+                          lambda r: r["red"]),
+        "green": Definition("more green than the other colours", ("greenness",), ("green",),
+                            lambda r: r["green"]),
+        "blue": Definition("more blue than the other colours", ("blueness",), ("blue",),
+                           lambda r: r["blue"]),
     }
+)  # fmt: skip
+"""Every trait that the package ships."""
 
 
 def trait_values(rows: Sequence[Mapping[str, float]]) -> dict[str, Float64]:
-    """For each trait one number for each member: how much its descriptors speak for the trait."""
-    d = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    # ranks in [0, 1] make descriptors of different units comparable
-    rank = {name: np.argsort(np.argsort(v, kind="stable"), kind="stable") / len(v)
-            for name, v in d.items()}  # fmt: skip
-    return {
-        "shiny": d["highlight"],
-        "matte": -d["highlight"],
-        # no body below the lobe: all light leaves as reflection
-        "metallic": np.cbrt(d["specular"]) - np.cbrt(d["diffuse"]),
-        # a clear, colourless highlight over a body
-        "plastic": np.minimum(np.minimum(rank["highlight"], rank["diffuse"]), 1.0 - rank["tint"]),
-        "rough": d["width"],
-        "bright": d["lightness"],
-        "red": d["red"],
-        "green": d["green"],
-        "blue": d["blue"],
+    """For each trait one grade for each member: how much its descriptors speak for the trait."""
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    # no body below the lobe: light leaves as reflection (cube roots, as lightness has them)
+    columns["reflection"] = np.cbrt(columns["specular"]) - np.cbrt(columns["diffuse"])
+    ranks = {
+        name: np.argsort(np.argsort(v, kind="stable"), kind="stable") / max(len(v) - 1, 1)
+        for name, v in columns.items()
     }
+    return {name: definition.grade(ranks) for name, definition in TRAITS.items()}
 
 
 def labels(values: Float64) -> NDArray[np.int8]:

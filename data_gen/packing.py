@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_gen.families import materials
-from data_gen.labels import descriptors, labels, trait_values
+from data_gen.labels import labels, trait_values
 from data_gen.tables import Progress, Tables
+from traitbrdf.descriptors import descriptors
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
 from traitbrdf.traits import TraitSpace
 

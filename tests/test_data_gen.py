@@ -14,11 +14,12 @@ import pytest
 from data_gen import __main__ as command
 from data_gen import packing, study, tables
 from data_gen.families import FAMILIES, materials
-from data_gen.labels import descriptors, labels, trait_values
+from data_gen.labels import labels, trait_values
 from data_gen.packing import build
 from data_gen.tables import table_of
 from traitbrdf.bench import MeasuredSet
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.descriptors import descriptors
 from traitbrdf.embedding import GRID, BRDFEmbedding, default_library
 from traitbrdf.formats import artifact, read_arrays
 from traitbrdf.lights import EnvironmentMap

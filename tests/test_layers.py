@@ -15,7 +15,7 @@ PACKAGE = ROOT / "traitbrdf"
 FLOORS = (
     ("directions", "formats"),
     ("models", "brdf", "measured", "lights", "shapes"),
-    ("profiles",),
+    ("profiles", "descriptors"),
     ("embedding", "traits", "strokes", "scene"),
     ("reference", "quadrature"),
     ("transport", "fitting"),

@@ -957,7 +957,7 @@ class Library:
         What the recipe of a member's family was given, by name: numbers, and colours as lists of
         three; empty where unknown. With the recipe's seed they are what `data_gen` draws.
     descriptors : dict of (n,) float64
-        Physical descriptors of each member's own table, by name (`data_gen/labels.py`).
+        Physical descriptors of each member's own table, by name (`traitbrdf/descriptors.py`).
     """
 
     def __init__(
