@@ -1,4 +1,5 @@
-"""``python -m data_gen``: rebuild the artifact that the package ships, or study embeddings."""
+"""``python -m data_gen``: rebuild the artifact that the package ships, or study embeddings
+and traits."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import time
 from pathlib import Path
 
 from data_gen.packing import COMPONENTS, COUNT, SEED, build
-from data_gen.study import CANDIDATES, study, table
+from data_gen.study import CANDIDATES, study, table, trait_table
 from data_gen.tables import Tables
 from traitbrdf.embedding import GRID
 from traitbrdf.formats import write_arrays
@@ -19,8 +20,9 @@ _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "libr
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen", description=__doc__)
     parser.add_argument(
-        "what", nargs="?", choices=("build", "study"), default="build",
-        help="build the artifact, or compare embeddings on measured materials (%(default)s)",
+        "what", nargs="?", choices=("build", "study", "traits"), default="build",
+        help="build the artifact, compare embeddings on measured materials, or tell of the traits "
+        "(%(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--data", type=Path, default=Path("../shared/data"),
@@ -57,6 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
             end = "\n" if fraction >= 1.0 else "\r"
             print(f"{stage}: {100 * fraction:3.0f} %", end=end, file=sys.stderr, flush=True)
 
+    if given.what == "traits":
+        print(trait_table())
+        return 0
     if given.what == "study":
         data = given.data if (given.data / "merl_slices").is_dir() else None
         try:

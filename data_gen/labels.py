@@ -1,15 +1,15 @@
 """Traits: what each means, and labels of library members from descriptors of their tables.
 
 Never from the parameters of the recipes, and never from ratings: what a table looks like decides,
-so that a measured material would get the same label. A trait's grade is a mean (or, where it takes
-all of several things at once, the least) of ranks of descriptors among the members; ranks make
-descriptors of different units comparable. Names are the 16 of Matusik et al. 2003 and the 14 of
-Serrano et al. 2016, and "shiny".
+so that a measured material would get the same label. A descriptor is graded by how common its value
+is among the members (`traitbrdf.traits.Grades`), which makes different units comparable; a trait's
+grade is a weighted sum of those. Names are the 16 of Matusik et al. 2003 and the 14 of Serrano et
+al. 2016, and "shiny".
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -17,144 +17,129 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
-Ranks = Mapping[str, Float64]
 
 SHARE = 1.0 / 3.0
 """Members in the upper third of a trait's grade have it, in the lower third have it not."""
 
 
 class Definition(NamedTuple):
-    """A trait: what it means in a line, everyday names, its descriptors, and its grade.
+    """A trait: what it means in a line, everyday names, and its grade from graded descriptors.
 
-    `grade` gets the rank in [0, 1] of every descriptor among the members.
+    A descriptor with a negative weight speaks against the trait.
     """
 
     meaning: str
     synonyms: tuple[str, ...]
-    descriptors: tuple[str, ...]
-    grade: Callable[[Ranks], Float64]
+    weights: Mapping[str, float]
 
 
-def _metallic(r: Ranks) -> Float64:
-    return 0.5 * r["highlight"] + 0.5 * r["reflection"]
-
+_METAL = {"highlight": 0.5, "reflection": 0.5}
 
 TRAITS: Mapping[str, Definition] = MappingProxyType(
     {
         "shiny": Definition(
-            "bright, clear highlights", ("lustrous", "polished"), ("highlight", "gloss_60"),
-            lambda r: 0.5 * r["highlight"] + 0.5 * r["gloss_60"],
+            "bright, clear highlights",
+            ("lustrous", "polished"),
+            {"highlight": 0.5, "gloss_60": 0.5},
         ),
         "glossy": Definition(
-            "highlights that stand out from what lies below", ("glossiness", "gloss"),
-            ("highlight",), lambda r: r["highlight"],
+            "highlights that stand out from what lies below",
+            ("glossiness", "gloss"),
+            {"highlight": 1.0},
         ),
-        "matte": Definition(
-            "no highlight stands out", ("flat", "dull"), ("highlight",),
-            lambda r: 1.0 - r["highlight"],
-        ),
+        "matte": Definition("no highlight stands out", ("flat", "dull"), {"highlight": -1.0}),
         "strength": Definition(
-            "how strong reflections are", ("reflective", "refstrng"), ("highlight", "specular"),
-            lambda r: 0.7 * r["highlight"] + 0.3 * r["specular"],
+            "how strong reflections are",
+            ("reflective", "refstrng"),
+            {"highlight": 0.7, "specular": 0.3},
         ),
         "sharpness": Definition(
-            "how sharply surroundings are mirrored", ("sharp", "refsharp", "mirror-like"),
-            ("highlight", "width"), lambda r: 0.5 * r["highlight"] + 0.5 * (1.0 - r["width"]),
+            "how sharply surroundings are mirrored",
+            ("sharp", "refsharp"),
+            {"highlight": 0.5, "width": -0.5},
         ),
-        "tint": Definition(
-            "colour of the reflections", ("tinted", "reftint"), ("tint",), lambda r: r["tint"],
-        ),
+        "tint": Definition("colour of the reflections", ("tinted", "reftint"), {"tint": 1.0}),
         "specular": Definition(
-            "how much light leaves as reflection", ("specularness",), ("specular",),
-            lambda r: r["specular"],
+            "how much light leaves as reflection", ("specularness",), {"specular": 1.0}
         ),
         "diffuse": Definition(
-            "how much light leaves scattered from the body", ("diffuseness",), ("diffuse",),
-            lambda r: r["diffuse"],
+            "how much light leaves scattered from the body", ("diffuseness",), {"diffuse": 1.0}
         ),
         "metallic": Definition(
-            "all light leaves as a strong reflection", ("metal", "metallic-like"),
-            ("highlight", "specular", "diffuse"), _metallic,
+            "all light leaves as a strong reflection", ("metal", "metallic-like"), _METAL
         ),
         "silver": Definition(
-            "a light, colourless metal", ("silvery", "silverness"),
-            ("highlight", "specular", "diffuse", "tint", "lightness"),
-            lambda r: np.minimum.reduce([_metallic(r), 1.0 - r["tint"], r["lightness"]]),
+            "a light, colourless metal",
+            ("silvery", "silverness"),
+            {"highlight": 0.25, "reflection": 0.25, "tint": -0.25, "lightness": 0.25},
         ),
         "gold": Definition(
-            "a metal of the colour of gold", ("golden", "gold-like"),
-            ("highlight", "specular", "diffuse", "gold"),
-            lambda r: np.minimum(_metallic(r), r["gold"]),
+            "a metal of the colour of gold",
+            ("golden", "gold-like"),
+            {"highlight": 0.25, "reflection": 0.25, "gold": 0.5},
         ),
         "plastic": Definition(
-            "a clear colourless highlight over a body", ("plastic-like",),
-            ("highlight", "diffuse", "tint"),
-            lambda r: np.minimum.reduce([r["highlight"], r["diffuse"], 1.0 - r["tint"]]),
+            "a clear colourless highlight over a body",
+            ("plastic-like",),
+            {"highlight": 0.35, "diffuse": 0.35, "tint": -0.3},
         ),
         "acrylic": Definition(
-            "a sharp colourless highlight over a saturated body", ("acrylic-like", "lacquered"),
-            ("width", "diffuse_chroma", "tint"),
-            lambda r: np.minimum.reduce([1.0 - r["width"], r["diffuse_chroma"], 1.0 - r["tint"]]),
+            "a sharp colourless highlight over a saturated body",
+            ("acrylic-like", "lacquered"),
+            {"width": -0.35, "diffuse_chroma": 0.35, "tint": -0.3},
         ),
         "ceramic": Definition(
-            "a sharp colourless highlight over a light body", ("porcelain", "glazed"),
-            ("width", "diffuse", "tint"),
-            lambda r: np.minimum.reduce([1.0 - r["width"], r["diffuse"], 1.0 - r["tint"]]),
+            "a sharp colourless highlight over a light body",
+            ("porcelain", "glazed"),
+            {"width": -0.35, "diffuse": 0.35, "tint": -0.3},
         ),
         "rubber": Definition(
-            "a dull dark surface", ("rubbery", "rubber-like"), ("highlight", "lightness"),
-            lambda r: 0.8 * (1.0 - r["highlight"]) + 0.2 * (1.0 - r["lightness"]),
+            "a dull dark surface",
+            ("rubbery", "rubber-like"),
+            {"highlight": -0.8, "lightness": -0.2},
         ),
         "fabric": Definition(
-            "no highlight, and light edges", ("cloth", "fabric-like"), ("highlight", "sheen"),
-            lambda r: 0.7 * (1.0 - r["highlight"]) + 0.3 * r["sheen"],
+            "no highlight, and light edges",
+            ("cloth", "fabric-like"),
+            {"highlight": -0.85, "sheen": 0.15},
         ),
         "soft": Definition(
-            "looks soft to the touch: hardly a highlight, light edges", (), ("highlight", "sheen"),
-            lambda r: 0.8 * (1.0 - r["highlight"]) + 0.2 * r["sheen"],
+            "looks soft to the touch: hardly a highlight, light edges",
+            (),
+            {"highlight": -0.9, "sheen": 0.1},
         ),
         "hard": Definition(
-            "looks hard to the touch: strong, narrow highlights", ("solid",),
-            ("highlight", "width"), lambda r: 0.7 * r["highlight"] + 0.3 * (1.0 - r["width"]),
+            "looks hard to the touch: strong, narrow highlights",
+            ("solid",),
+            {"highlight": 0.7, "width": -0.3},
         ),
         "rough": Definition(
-            "wide, weak highlights", ("roughness", "coarse"), ("highlight", "width"),
-            lambda r: 0.5 * (1.0 - r["highlight"]) + 0.5 * r["width"],
+            "wide, weak highlights", ("roughness", "coarse"), {"highlight": -0.5, "width": 0.5}
         ),
         "greasy": Definition(
-            "strong highlights with a haze around them", ("oily", "greasiness"),
-            ("highlight", "haze"), lambda r: np.minimum(r["highlight"], r["haze"]),
+            "strong highlights with a haze around them",
+            ("oily", "greasiness"),
+            {"highlight": 0.5, "haze": 0.5},
         ),
         "dusty": Definition(
-            "dull and pale, with light edges", ("dustiness", "powdery"),
-            ("highlight", "sheen", "diffuse_chroma"),
-            lambda r: (1.0 - r["highlight"] + r["sheen"] + 1.0 - r["diffuse_chroma"]) / 3.0,
+            "dull and pale, with light edges",
+            ("dustiness", "powdery"),
+            {"highlight": -0.34, "sheen": 0.33, "diffuse_chroma": -0.33},
         ),
-        "bright": Definition(
-            "how light it is", ("light", "brightness"), ("body_lightness",),
-            lambda r: r["body_lightness"],
-        ),
-        "red": Definition("more red than the other colours", ("redness",), ("red",),
-                          lambda r: r["red"]),
-        "green": Definition("more green than the other colours", ("greenness",), ("green",),
-                            lambda r: r["green"]),
-        "blue": Definition("more blue than the other colours", ("blueness",), ("blue",),
-                           lambda r: r["blue"]),
+        "bright": Definition("how light it is", ("light", "brightness"), {"lightness": 1.0}),
+        "red": Definition("more red than the other colours", ("redness",), {"red": 1.0}),
+        "green": Definition("more green than the other colours", ("greenness",), {"green": 1.0}),
+        "blue": Definition("more blue than the other colours", ("blueness",), {"blue": 1.0}),
     }
-)  # fmt: skip
+)
 """Every trait that the package ships."""
 
 
-def trait_values(rows: Sequence[Mapping[str, float]]) -> dict[str, Float64]:
-    """For each trait one grade for each member: how much its descriptors speak for the trait."""
-    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    # no body below the lobe: light leaves as reflection (cube roots, as lightness has them)
-    columns["reflection"] = np.cbrt(columns["specular"]) - np.cbrt(columns["diffuse"])
-    ranks = {
-        name: np.argsort(np.argsort(v, kind="stable"), kind="stable") / max(len(v) - 1, 1)
-        for name, v in columns.items()
-    }
-    return {name: definition.grade(ranks) for name, definition in TRAITS.items()}
+def grading() -> tuple[tuple[str, ...], Float64]:
+    """The descriptors that traits use, and their weights (traits, descriptors)."""
+    names = tuple(dict.fromkeys(name for d in TRAITS.values() for name in d.weights))
+    weights = np.array([[d.weights.get(name, 0.0) for name in names] for d in TRAITS.values()])
+    return names, weights
 
 
 def labels(values: Float64) -> NDArray[np.int8]:

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from data_gen.families import materials
-from data_gen.labels import labels, trait_values
+from data_gen.labels import TRAITS, grading, labels
 from data_gen.tables import Progress, Tables
-from traitbrdf.descriptors import descriptors
+from traitbrdf.descriptors import READINGS, describe, read, reading_rows
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
-from traitbrdf.traits import TraitSpace
+from traitbrdf.traits import Grades, Optics, Readings, TraitSpace
 
 COUNT = 2040
 SEED = 0
@@ -55,17 +56,29 @@ def build(
     report("embedding", 0.0)
     # coordinates of the embedding as it ships, with its rounded components
     embedding = BRDFEmbedding.from_arrays(embedding.fit(tables).arrays())
-    encoded, rows = [], []
+    encoded, readings = [], []
     for table in tables:
         encoded.append(embedding.least_squares(channel_logs(table)[None])[0])
-        rows.append(descriptors(table))
+        readings.append(read(table))
     coordinates = np.stack(encoded).astype(np.float32)
     embedding.low_ = coordinates.min(axis=0).astype(np.float64)
     embedding.high_ = coordinates.max(axis=0).astype(np.float64)
     report("embedding", 1.0)
-    marks = {name: labels(values) for name, values in trait_values(rows).items()}
+    described = describe(np.stack(readings))
+    names, weights = grading()
+    grades = Grades.fit({name: described[name] for name in names})
+    values = weights @ grades.of(np.stack(list(described.values()), axis=1)).T
+    marks = {name: labels(value) for name, value in zip(TRAITS, values, strict=True)}
     space = TraitSpace.fit(
-        coordinates, marks, embedding.low_, embedding.high_, tables.families, embedding.body_rows()
+        coordinates,
+        marks,
+        embedding.low_,
+        embedding.high_,
+        tables.families,
+        embedding.body_rows(),
+        Optics(few_cells(embedding, coordinates), grades),
+        weights,
+        {name: (trait.meaning, trait.synonyms) for name, trait in TRAITS.items()},
     )
     report("traits", 1.0)
     return {
@@ -76,7 +89,34 @@ def build(
         "parameters": np.array([json.dumps(m.parameters) for m in materials(seed, count)]),
         "seed": np.array(seed, np.int64),
         "coordinates": coordinates,
-        "descriptor_names": np.array(list(rows[0])),
-        "descriptors": np.array([list(row.values()) for row in rows], np.float32),
+        "descriptor_names": np.array(list(described)),
+        "descriptors": np.stack(list(described.values()), axis=1).astype(np.float32),
         "labels": np.stack([marks[name] for name in space.names]),
     }
+
+
+def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
+    """How readings are had of coordinates: those that take many cells, the albedo and the flux
+    into a gloss meter, by few that give the same on the members.
+
+    Cells and weights are found by non-negative least squares of relative errors (Lawson & Hanson
+    1974, chapter 23), so that nothing can come out negative.
+    """
+    rows = reading_rows(embedding.grid_).toarray()
+    some = coordinates[:: max(len(coordinates) // 700, 1)]
+    members = np.clip(some, embedding.low_, embedding.high_)
+    tables = np.stack([embedding.decode_values(z).mean(axis=1) for z in members])
+    rng = np.random.default_rng(0)
+    for i in range(len(READINGS)):
+        used = np.flatnonzero(rows[i])
+        if len(used) > 40:
+            relative = tables[:, used] / np.maximum(tables @ rows[i], 1e-6)[:, None]
+            weighty = np.argsort(rows[i, used] * relative.mean(axis=0))
+            others = rng.choice(weighty[:-40], min(60, len(used) - 40), replace=False)
+            chosen = np.sort(np.append(weighty[-40:], others))
+            found, _ = nnls(relative[:, chosen], np.ones(len(relative)))
+            rows[i] = 0.0
+            rows[i, used[chosen]] = found
+    kept = np.flatnonzero(rows.any(axis=0))
+    log_rows, mean = embedding.log_rows(kept)
+    return Readings(log_rows, mean, rows[:, kept])

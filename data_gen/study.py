@@ -20,15 +20,18 @@ from sklearn.cluster import KMeans
 from sklearn.utils.extmath import randomized_svd
 
 from data_gen.families import materials
+from data_gen.labels import TRAITS, labels
 from data_gen.tables import Progress, table_of
-from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets
+from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets, spearman
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.embedding import FLOOR, GRID, OPPONENT
+from traitbrdf.descriptors import DESCRIPTORS
+from traitbrdf.embedding import FLOOR, GRID, OPPONENT, default_library
 from traitbrdf.formats import encode_srgb
 from traitbrdf.lights import EnvironmentMap
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.scene import Scene
 from traitbrdf.shapes import sphere
+from traitbrdf.traits import RELATED, default_traits, straight
 from traitbrdf.transport import Operator
 
 Float64: TypeAlias = NDArray[np.float64]
@@ -324,4 +327,41 @@ def table(rows: Sequence[tuple[Candidate, dict[str, float]]]) -> str:
             *(f"{result[name]:.{1 if 'dB' in name else 3}f}" for name in names),
         )  # fmt: skip
         lines.append("| " + " | ".join(parts) + " |")
+    return "\n".join(lines)
+
+
+def trait_table() -> str:
+    """Every shipped trait: what it means and reads, what it goes with, and how well straight
+    vectors and scores read off coordinates rank members that they were not fitted to.
+
+    Rank correlations with the grades of the members' own tables: of the normal of a linear support
+    vector machine and of the difference of class means, on every fifth member after a fit to the
+    others' labels, and of the shipped scores, of which only the grades' scale is fitted.
+    """
+    library, space = default_library(), default_traits()
+    assert space.optics is not None
+    columns = [library.descriptors[name] for name in DESCRIPTORS]
+    values = space.optics.grades.of(np.stack(columns, axis=1)) @ space.weights.T
+    z, scores = library.coordinates, space.scores(library.coordinates)
+    test = np.arange(len(z)) % 5 == 0
+    lines = [
+        "| trait | means | also | reads | machine | class means | read off | goes with |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for i, (name, trait) in enumerate(TRAITS.items()):
+        value = values[:, i]
+        marks = labels(value)[~test]
+        found = [spearman(z[test] @ straight(z[~test], marks, name, m), value[test])
+                 for m in (False, True)]  # fmt: skip
+        found.append(spearman(scores[test, i], value[test]))
+        reads = ", ".join(f"{w:+g} {d}" for d, w in trait.weights.items())
+        near = [
+            f"{space.names[j]} {space.related[i, j]:+.2f}"
+            for j in np.argsort(-np.abs(space.related[i]))
+            if j != i and abs(space.related[i, j]) >= RELATED
+        ]
+        near = near[:5] + ([f"and {len(near) - 5} more"] if len(near) > 5 else [])
+        cells = [name, trait.meaning, ", ".join(trait.synonyms), reads]
+        cells += [f"{value:.3f}" for value in found]
+        lines.append(f"| {' | '.join(cells)} | {', '.join(near)} |")
     return "\n".join(lines)

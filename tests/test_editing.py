@@ -26,7 +26,7 @@ from traitbrdf.formats import FormatError, read_arrays, write_arrays
 from traitbrdf.models import GGX, Lambert, PerfectMirror
 from traitbrdf.shapes import Mesh
 from traitbrdf.strokes import Stroke, follow
-from traitbrdf.traits import default_traits
+from traitbrdf.traits import Trait, default_traits
 from traitbrdf.transport import Training, Transport
 
 TRAITS = default_traits().names
@@ -171,11 +171,13 @@ def test_an_edited_table_keeps_what_it_has_beyond_the_manifold(edit):
     table = tb.TabulatedBRDF.from_model(GGX(0.2, 1.5, 0.0), EMBEDDING.grid_)
     edit.assign("body", table)
     offset = edit.material("body").offset
-    edit.move("body", rough=0.1)
-    edit.move("body", rough=-0.1)
+    edit.move("body", bright=0.05)
     assert edit.material("body").offset is offset
-    again, first = edit.brdf("body").values, table.values
-    assert np.median(np.abs(again - first) / (first + 1e-3)) < 0.01
+    moved, z = edit.brdf("body").values, edit.material("body").z
+    same(moved, EMBEDDING.decode_values(z, offset).reshape(table.values.shape))
+    edit.move("body", bright=-0.05)
+    again = edit.brdf("body").values
+    assert np.median(np.abs(again - table.values) / (table.values + 1e-3)) < 0.02
 
 
 def test_a_perfect_mirror_shows_the_map(edit):
@@ -328,7 +330,7 @@ def test_painting_a_part_changes_no_pixel_outside_and_does_what_it_says(edit):
     assert np.any(after[handle] != before[handle], axis=-1).mean() > 0.99
     assert edit.scores("handle")["shiny"] - score["shiny"] >= 0.9 * 0.6
     for colour in ("red", "green", "blue"):  # held unless it is painted
-        assert edit.scores("handle")[colour] == pytest.approx(score[colour], abs=1e-6)
+        assert edit.scores("handle")[colour] == pytest.approx(score[colour], abs=1e-4)
 
 
 def test_painting_a_colour_holds_none(edit):
@@ -341,9 +343,9 @@ def test_what_is_held_stays(edit):
     edit.assign("body", "blue-plastic")
     score = edit.scores("body")
     edit.paint(on(edit.scene, "body", 0.3, "shiny", hold=("bright",)))
-    assert edit.scores("body")["bright"] == pytest.approx(score["bright"], abs=1e-6)
+    assert edit.scores("body")["bright"] == pytest.approx(score["bright"], abs=1e-4)
     edit.move("body", shiny=0.3, hold=("colour", "bright"))
-    assert edit.scores("body")["bright"] == pytest.approx(score["bright"], abs=1e-6)
+    assert edit.scores("body")["bright"] == pytest.approx(score["bright"], abs=1e-4)
 
 
 def test_a_stroke_over_several_parts_is_shared(edit):
@@ -1716,7 +1718,7 @@ def test_edits_near_an_exact_frame_are_shown_by_the_basis(lacking, monkeypatch):
     frame = session.render()
     assert session.report()["parts"]["sphere"]["tier"] == "exact"
     for amount in (0.03, -0.05, 0.04):
-        session.move("sphere", shiny=amount)
+        session.move("sphere", bright=amount)
         session.render()
         (shown,) = session._view.shown
         assert shown.tier == "trained"
@@ -1868,3 +1870,40 @@ def test_a_graphics_card_shows_the_same(prepared_ball):
         assert session.report()["device"] == device
     np.testing.assert_allclose(frames[1], frames[0], rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-3, atol=1e-3 * np.abs(slopes[0]).max())
+
+
+# -- what a move came to ---------------------------------------------------------------------------
+
+
+def test_a_move_says_how_far_it_came(edit):
+    edit.assign("handle", "red-rubber")
+    assert edit.reached("handle") is None
+    edit.move("handle", shiny=0.3)
+    found = edit.reached("handle")
+    assert found.complete and found.reached["shiny"] == pytest.approx(0.3, abs=3e-3)
+    assert edit.reached("body") is None
+    assert "shiny +0.30 of +0.30" in edit.report()["parts"]["handle"]["move"]
+    edit.undo()
+    assert edit.reached("handle") is None
+    edit.move("handle", metallic=50.0)
+    assert not edit.reached("handle").complete
+    assert 0.0 <= edit.plausibility("handle")["plausibility"] <= 1.0
+    edit.undo()
+    edit.move("handle", photoreal=False, metallic=3.0)
+    assert "photoreal=False" in edit.history[-1]
+
+
+def test_a_trait_of_one_s_own_is_saved_with_the_design(edit, tmp_path):
+    edit.add_trait(Trait.from_labels("candy", ["blue-plastic", "red-rubber"], [1, -1]))
+    edit.assign("handle", "red-rubber")
+    edit.move("handle", candy=0.3)
+    edit.paint(on(edit.scene, "handle", 0.1, "candy"))
+    edit.save(tmp_path / "own.tbr")
+    again = tb.EditSession.load(tmp_path / "own.tbr")
+    assert again.traits.names == edit.traits.names
+    assert again.scores("handle") == edit.scores("handle")
+    again.move("handle", candy=0.1)
+    with pytest.raises(ValueError, match="unknown trait 'candy'"):
+        tb.EditSession.load(tmp_path / "own.tbr", traits=tb.default_traits()).move(
+            "handle", candy=0.1
+        )

@@ -16,16 +16,17 @@ FLOORS = (
     ("directions", "formats"),
     ("models", "brdf", "measured", "lights", "shapes"),
     ("profiles", "descriptors"),
-    ("embedding", "traits", "strokes", "scene"),
+    ("embedding", "strokes", "scene"),
     ("reference", "quadrature"),
-    ("transport", "fitting"),
+    ("transport", "fitting", "gallery"),
+    ("traits",),
     ("editing",),
     ("bench",),
     ("studio",),
     ("cli",),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
-ARRAYS_ONLY = ("traits", "strokes")
+ARRAYS_ONLY = ("strokes",)
 """Modules that know no BRDF and no scene: they import the ground floor alone."""
 
 HOMES = {
@@ -33,7 +34,7 @@ HOMES = {
     "sklearn": {"embedding", "traits"},
     "embreex": {"shapes"},
     "trimesh": {"shapes"},
-    "numba": {"profiles", "quadrature"},
+    "numba": {"descriptors", "profiles", "quadrature", "traits"},
 }
 """Where else's package may be imported."""
 

@@ -125,7 +125,7 @@ def test_hello_has_all_that_a_page_needs(session):
     assert state["ready"] and state["fraction"] == 1.0
     assert 0.0 < state["error"] < 0.1
     assert set(state["scores"]) == set(header["traits"])
-    assert set(state["plausibility"]) == {"energy_scale", "gamut_margin"}
+    assert set(state["plausibility"]) == {"energy_scale", "gamut_margin", "plausibility"}
     json.dumps(header, allow_nan=False)
     image = session.edit.render(exact=False)
     shown = Screen().draw(replies).astype(int)

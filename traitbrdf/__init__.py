@@ -26,6 +26,7 @@ from traitbrdf.shapes import sphere as sphere
 from traitbrdf.shapes import teapot as teapot
 from traitbrdf.strokes import Stroke as Stroke
 from traitbrdf.studio import studio as studio
+from traitbrdf.traits import Trait as Trait
 from traitbrdf.traits import TraitSpace as TraitSpace
 from traitbrdf.traits import default_traits as default_traits
 
@@ -48,6 +49,7 @@ __all__ = [
     "Scene",
     "Stroke",
     "TabulatedBRDF",
+    "Trait",
     "TraitSpace",
     "default_embedding",
     "default_library",

@@ -8,6 +8,7 @@ before they are timed.
 from __future__ import annotations
 
 import concurrent.futures
+import csv
 import importlib
 import itertools
 import math
@@ -20,11 +21,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from traitbrdf import editing, models, reference
 from traitbrdf.brdf import (
@@ -34,15 +37,17 @@ from traitbrdf.brdf import (
     TabulatedBRDF,
     albedo_operator,
 )
+from traitbrdf.descriptors import LUMINANCE, cielab, hue
 from traitbrdf.directions import from_half_diff_angles, to_local
 from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession, trusted_error
 from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
+from traitbrdf.gallery import own_colours
 from traitbrdf.lights import EnvironmentMap, texel_moments
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.profiles import HIGHLIGHT
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import sphere, teapot
-from traitbrdf.traits import default_traits
+from traitbrdf.traits import RELATED, Trait, TraitSpace, default_traits, suggest
 from traitbrdf.transport import Operator, Training, Transport, training_tables
 
 Float32 = NDArray[np.float32]
@@ -182,12 +187,6 @@ def _channels(tables: Sequence[TabulatedBRDF]) -> Float32:
     """(cells, 3 B) of B tables, each colour channel a column."""
     flat = [table.values.reshape(-1, 3).astype(np.float32) for table in tables]
     return np.concatenate(flat, axis=1)
-
-
-def _own_colours(images: Float32) -> Float32:
-    """(m, B, 3) of images (m, 3, 3 B): each colour of the light under its own channel."""
-    each = images.reshape(*images.shape[:2], images.shape[2] // 3, 3)
-    return np.ascontiguousarray(np.einsum("mcbc->mbc", each))
 
 
 # -- the oracle -----------------------------------------------------------------------------------
@@ -339,7 +338,7 @@ def _shown(transport: Transport, tables: Sequence[TabulatedBRDF], index: Int64) 
         for some in np.array_split(wrong, math.ceil(len(wrong) / 16)) if len(wrong) else []:
             own = _channels([tables[b] for b in some])
             images = transport.operator.part_images(part, own, interpolate=False)
-            exact = _own_colours(images[index[mine] - span.start])
+            exact = own_colours(images[index[mine] - span.start])
             final[mine[:, None], some] = exact
     return _Shown(basis, final, measured, refused)
 
@@ -556,7 +555,7 @@ def shadow_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
             dark = np.flatnonzero(lit < 0.9 * unhidden)
             index, true, _ = _drawn(oracle, scene, dark + span.start, count, rng)
             images = operator.part_images(ground, _channels(tables))[index - span.start]
-            errors.append(_errors(_own_colours(images), true))
+            errors.append(_errors(own_colours(images), true))
             say(f"  {name:12s} {_spread(errors[-1])}")
     percent = 100.0 * np.stack(errors)
     how = (
@@ -748,7 +747,7 @@ def spheres_compared(
     linear, exposed, error = np.empty((3, len(environments), len(tables)))
     for m, environment in enumerate(environments):
         operator = Operator(Scene(sphere(), environment, size=size), tables[0].grid)
-        images = _own_colours(operator.part_images(0, _channels([*tables, *shown])))
+        images = own_colours(operator.part_images(0, _channels([*tables, *shown])))
         for i, (true, found) in enumerate(zip(*np.split(images.swapaxes(0, 1), 2), strict=True)):
             linear[m, i] = decibels(float(true.max()), float(np.mean((true - found) ** 2)))
             scale = 0.8 / np.quantile(true.max(axis=1), 0.9)
@@ -855,6 +854,243 @@ def log_error(
     shown = np.einsum("nk,nkc->nc", weight, table[index])
     error: Float64 = np.abs(np.log(shown + FLOOR) - np.log(np.maximum(rgb, 0.0) + FLOOR))
     return error
+
+
+# -- traits ---------------------------------------------------------------------------------------
+
+RATINGS = MappingProxyType(
+    {
+        "glossy": ("glossy", 0.88), "strength": ("refstrng", 0.88), "sharpness": ("refsharp", 0.88),
+        "matte": ("matte", 0.88), "metallic": ("metallic", 0.80), "hard": ("hard", 0.68),
+        "rough": ("rough", 0.68), "rubber": ("rubber", 0.68), "soft": ("soft", 0.68),
+        "fabric": ("fabric", 0.60), "bright": ("bright", 0.45), "plastic": ("plastic", None),
+        "ceramic": ("ceramic", None), "tint": ("reftint", None),
+    }
+)  # fmt: skip
+"""Traits that people have rated: the column of the ratings, and the correlation asked for."""
+
+
+def trait_laws(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
+    """Traits: agreement with people, and what moves do to the rest, to hues and to physics."""
+    if data is not None and (data / "ratings").is_dir():
+        yield from _rated(data, quick, say)
+    yield from _half_moves(24 if quick else 500, say)
+    yield from _monotone(25 if quick else 500)
+    yield from _composites(50 if quick else 10_000)
+
+
+def rated_materials(data: Path) -> tuple[list[str], Float64, dict[str, Float64]]:
+    """Names, encoded coordinates (n, k) and mean ratings (n,) by column of rated materials."""
+    with (data / "ratings" / "serrano2016_merl_half.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    known = measured_sets(data)[0]
+    embedding = default_library().embedding
+    names = [row["material"] for row in rows]
+    z = [embedding.encode_samples(*known.angles, known.materials[name]) for name in names]
+    columns = [column for column in rows[0] if column != "material"]
+    return names, np.array(z), {c: np.array([float(row[c]) for row in rows]) for c in columns}
+
+
+def _rated(data: Path, quick: bool, say: Say) -> Iterator[Record]:
+    names, z, ratings = rated_materials(data)
+    space, rng = default_traits(), np.random.default_rng(0)
+    scores = space.scores(z)
+    grades = space.grades(z)
+    repeats = 50 if quick else 1000
+    for name, (column, floor) in RATINGS.items():
+        mine, theirs = scores[:, space.index(name)], ratings[column]
+        found = spearman(mine, theirs)
+        drawn = rng.integers(len(names), size=(repeats, len(names)))
+        low, high = np.percentile([spearman(mine[i], theirs[i]) for i in drawn], [2.5, 97.5])
+        fitted = np.mean([_cross_validated(grades, theirs, rng) for _ in range(10)])
+        how = f"Spearman, {len(names)} encoded MERL slices; 95 % by bootstrap {low:.2f} to "
+        how += f"{high:.2f}; a fit to half of the ratings reaches {fitted:.2f} on the other half"
+        if floor is None:
+            yield Record(f"people, {name}", found, "", how=how)
+        else:
+            yield Record.at_least(f"people, {name}", found, "", floor, how=how)
+    theirs = ratings["glossy"]
+    labels = np.digitize(theirs, np.quantile(theirs, [1 / 3, 2 / 3])) - 1
+    plain = [_relearnt(space, z, labels, theirs, _drawn_labels(labels, rng)) for _ in range(20)]
+    how = "Spearman with the ratings of the others, 12 labels by thirds of the ratings"
+    random = float(np.mean(plain))
+    yield Record.at_least(
+        "glossy from 12 labels", random, "", 0.85, how=f"{how}, mean of 20 random choices"
+    )
+    guided = []
+    for _ in range(20):
+        chosen = [int(i) for i in _drawn_labels(labels, rng)[:2]]
+        while len(chosen) < 12:
+            rest = [i for i in range(len(z)) if i not in chosen]
+            chosen.append(rest[suggest(z[chosen], z[rest], space)])
+        guided.append(_relearnt(space, z, labels, theirs, np.array(chosen)))
+    how += ", two random ones and ten suggested, mean of 20"
+    yield Record.at_least(
+        "glossy from suggested labels", float(np.mean(guided)), "", random, how=how
+    )
+
+
+def spearman(a: Float64, b: Float64) -> float:
+    """Rank correlation, ties shared."""
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+
+
+def _cross_validated(grades: Float64, ratings: Float64, rng: np.random.Generator) -> float:
+    """Spearman on half of the materials of a ridge fit to the other half."""
+    order = rng.permutation(len(ratings))
+    fit, test = order[: len(order) // 2], order[len(order) // 2 :]
+    centre = grades[fit].mean(axis=0)
+    x, y = grades[fit] - centre, ratings[fit] - ratings[fit].mean()
+    weights = np.linalg.solve(x.T @ x + 5.0 * np.eye(x.shape[1]), x.T @ y)
+    return spearman(grades[test] @ weights, ratings[test])
+
+
+def _drawn_labels(labels: Int64, rng: np.random.Generator) -> Int64:
+    """Twelve materials with both labels among the first two."""
+    while True:
+        chosen = rng.permutation(len(labels))[:12]
+        if labels[chosen[0]] * labels[chosen[1]] < 0:
+            return chosen
+
+
+def _relearnt(
+    space: TraitSpace, z: Float64, labels: Int64, ratings: Float64, chosen: Int64
+) -> float:
+    trait = Trait.from_labels("my gloss", z[chosen], labels[chosen], space)
+    others = np.setdiff1d(np.arange(len(z)), chosen)
+    return spearman(space.grades(z[others]) @ trait.weights, ratings[others])
+
+
+def _half_moves(count: int, say: Say) -> Iterator[Record]:
+    """Moves by half a unit, of every trait from as many members in all."""
+    library, space, rng = default_library(), default_traits(), np.random.default_rng(0)
+    all_scores = space.scores(library.coordinates)
+    most = np.percentile(all_scores, 99.0, axis=0)
+    starts = rng.choice(len(library), count, replace=False)
+    whole: list[float] = []
+    drift: list[float] = []
+    held: list[float] = []
+    times: list[float] = []
+    ended: list[float] = []
+    beyond = forbidden = 0
+    for trait, name in enumerate(space.names):
+        apart = np.flatnonzero(np.abs(space.related[trait]) < RELATED)
+        reached = []
+        for i in starts:
+            z = library.coordinates[i]
+            if all_scores[i, trait] + 0.5 > most[trait]:
+                beyond += 1
+                continue
+            found = space.reach(z, {name: 0.5})
+            reached.append(found.reached[name] / 0.5)
+            if found.complete:
+                change = space.scores(found.z) - space.scores(np.clip(z, space.low, space.high))
+                drift.append(float(np.abs(change[apart]).mean()))
+            # what a user holds: colour, or some of what is not related
+            keep = [space.names[j] for j in rng.permutation(apart)[:3]]
+            start = time.perf_counter()
+            kept = space.reach(z, {name: 0.5}, keep)
+            spent = 1e3 * (time.perf_counter() - start)
+            (times if kept.complete else ended).append(spent)
+            if kept.stopped.startswith("held"):
+                forbidden += 1
+            else:
+                held += [abs(v) for v in kept.held.values()]
+        share = float(np.mean(np.array(reached) >= 0.9))
+        say(f"  {name}: {100 * share:.0f} % of {len(reached)} starts")
+        whole.append(share)
+    tried = len(starts) * len(space.names)
+    how = f"+0.5 of each trait from {count} members; {beyond} of {tried} are left out, "
+    how += "which would go beyond 99 % of the library"
+    yield Record.at_least("moves that reach 90 %, least of a trait", min(whole), "", 0.9, how=how)
+    yield Record("moves that reach 90 %, mean of traits", float(np.mean(whole)), "", how=how)
+    how = "traits of rank correlation below 0.5 with the moved one; mean |change| of a score"
+    yield Record.at_most("unrelated traits, not held", float(np.mean(drift)), "", 0.15, how=how)
+    how = "three unrelated traits at a time; greatest |change| of a score; "
+    how += (
+        f"{forbidden} of {len(times) + len(ended)} moves are refused, for what is held forbids them"
+    )
+    yield Record.at_most("unrelated traits, held", max(held), "", 0.02, how=how)
+    how = f"{len(times)} moves of +0.5 with three traits held; error: change of a held score"
+    yield Record.at_most(
+        "a held move, median", float(np.median(times)), "ms", 5.0, error=max(held), how=how
+    )
+    yield Record("a held move, 95th", float(np.percentile(times, 95.0)), "ms", how=how)
+    how = f"{len(ended)} of the same that end at the gamut, or are refused"
+    yield Record("a held move that ends early, median", float(np.median(ended)), "ms", how=how)
+
+
+def _monotone(count: int) -> Iterator[Record]:
+    library, space, rng = default_library(), default_traits(), np.random.default_rng(1)
+    good = 0
+    for n, i in enumerate(rng.choice(len(library), count, replace=False)):
+        z, name = library.coordinates[i], space.names[n % len(space.names)]
+        scores = [
+            space.score(space.reach(z, {name: amount}).z)[name]
+            for amount in np.linspace(-1.5, 1.5, 13)
+        ]
+        good += bool(np.all(np.diff(scores) >= -1e-3))
+    how = (
+        f"scores rise with the amount, -1.5 to 1.5 in steps of 0.25, {count} starts, traits in turn"
+    )
+    yield Record.at_least("monotone moves", good / count, "", 0.99, how=how)
+
+
+def _composites(count: int) -> Iterator[Record]:
+    """Random edits of two traits by up to 3: physics, and hues where colour is held."""
+    library, space, rng = default_library(), default_traits(), np.random.default_rng(2)
+    embedding = library.embedding
+    grid = embedding.grid_
+    rows = albedo_operator(grid, ALBEDO_ANGLES)
+    least, albedo, hole, turned = math.inf, 0.0, 0.0, []
+    colourful = {"red", "green", "blue"}
+    for _ in range(count):
+        z = library.coordinates[rng.integers(len(library))]
+        pair = rng.choice(space.names, 2, replace=False)
+        amounts = dict(zip(pair.tolist(), rng.uniform(-3.0, 3.0, 2).tolist(), strict=True))
+        held = not colourful & set(amounts)
+        moved = space.reach(z, amounts, ("colour",) if held else ()).z
+        before, after = (embedding.decode_values(point) for point in (embedding.clip(z), moved))
+        least = min(least, float(after.min()))
+        albedo = max(albedo, float((rows @ after).max()))
+        hole = max(hole, highlight_hole(grid, after))
+        if held:
+            turned += hue_change(grid, before, after)
+    how = f"{count} random edits of two traits by up to 3, {grid.size} cells each"
+    yield Record.at_least("composite edits, least f", least, "1/sr", 0.0, how=how)
+    yield Record.at_most("composite edits, greatest albedo", albedo, "", 1.001, how=how)
+    yield Record.at_most("composite edits, deepest hole", 100.0 * hole, "%", 2.0, how=how)
+    how = f"CIELAB hue of body and lobe, {len(turned)} that have one (C*ab above 5)"
+    share = float(np.mean(np.array(turned) <= 2.0))
+    yield Record("hue kept within 2 degrees, share", share, "", how=how)
+    yield Record.at_most("hue, greatest change", max(turned), "deg", 2.0, how=how)
+
+
+def hue_change(grid: HalfDiffGrid, before: NDArray[Any], after: NDArray[Any]) -> list[float]:
+    """Degrees by which the hues of the body and of the lobe of f (cells, 3) changed, where both
+    tables have one: chroma above 5 at a luminance of 0.3, and a lobe half as high as the body."""
+    found = []
+    colours = [_body_and_lobe(grid, values) for values in (before, after)]
+    for one, two in zip(*colours, strict=True):
+        if one is None or two is None:
+            continue
+        first, second = (hue(cielab(0.3 * c / float(c @ LUMINANCE))) for c in (one, two))
+        if min(first[1], second[1]) > 5.0:
+            away = abs(first[0] - second[0]) % 360.0
+            found.append(float(min(away, 360.0 - away)))
+    return found
+
+
+def _body_and_lobe(grid: HalfDiffGrid, values: NDArray[Any]) -> list[Float64 | None]:
+    """RGB of the body (theta_h 40 to 55, theta_d to 20 degrees) and of the lobe's peak above it
+    (theta_d 15 to 50), over all phi_d; None where there is too little of it."""
+    f = np.asarray(values, np.float64).reshape(*grid.shape, 3)
+    h, d = np.degrees(grid.theta_h), np.degrees(grid.theta_d)
+    body = f[(h > 40.0) & (h < 55.0)][:, d < 20.0].mean(axis=(0, 1, 2))
+    lobe = f[0, (d > 15.0) & (d < 50.0)].mean(axis=(0, 1)) - body
+    seen = float(body @ LUMINANCE) > 0.004
+    stands = float(lobe @ LUMINANCE) > 0.004 + float(body @ LUMINANCE) and bool(np.all(lobe > 0.0))
+    return [body if seen else None, lobe if stands else None]
 
 
 def _milliseconds(call: Callable[[], object], repeats: int) -> float:
@@ -1132,6 +1368,7 @@ BENCHES: dict[str, Callable[[Path | None, bool, Say], Iterator[Record]]] = {
     "shadows": shadow_error,
     "table": table_error,
     "embedding": embedding_error,
+    "traits": trait_laws,
     "edit": edit_speed,
     "prepare": preparation,
 }

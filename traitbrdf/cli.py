@@ -27,6 +27,8 @@ from traitbrdf.shapes import Shape
 from traitbrdf.strokes import follow
 
 DEMO_MATERIAL = "red-rubber"
+GALLERY = ("blue-plastic", "gold-polished", "red-rubber")
+
 DEMO_CAMERA = (-35.0, 20.0, 1.05)
 DEMO_AMOUNT = 0.8
 
@@ -97,6 +99,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     studio.add_argument("--no-browser", action="store_true", help="only print the address")
     studio.set_defaults(run=_studio, ground=2.0)
+
+    gallery = commands.add_parser("gallery", help="spheres of materials, moved along their traits")
+    gallery.add_argument(
+        "--trait", action="append", default=[], metavar="NAME",
+        help="move these from -1 to 1; may be repeated; 'all' is every trait",
+    )  # fmt: skip
+    gallery.add_argument(
+        "--material", action="append", default=[], metavar="NAME",
+        help=f"library names (default: {', '.join(GALLERY)})",
+    )  # fmt: skip
+    gallery.add_argument(
+        "--hold", action="append", default=[], metavar="TRAIT", help="trait that shall stay"
+    )
+    gallery.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a sky")
+    gallery.add_argument("--size", type=_size, default=96, help="pixels a sphere (%(default)s)")
+    gallery.add_argument("--out", type=Path, required=True, help="picture (.png)")
+    gallery.set_defaults(run=_gallery)
 
     info = commands.add_parser("info", help="what the package ships, or what a file holds")
     info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
@@ -341,6 +360,34 @@ def _material(name: str) -> str | Reflectance:
         return tb.MeasuredBRDF.read(name)
     tb.default_library().index(name)
     return name
+
+
+def _gallery(given: argparse.Namespace) -> int:
+    from traitbrdf.gallery import sheet
+
+    library, space = tb.default_library(), tb.default_traits()
+    traits = list(space.names) if "all" in given.trait else given.trait
+    names = given.material or list(GALLERY)
+    steps = np.linspace(-1.0, 1.0, 7)
+    for name in traits:
+        space.index(name)
+    environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
+    rows, columns = {}, [f"{step:+.2f}" for step in steps] if traits else []
+    for name in names:
+        z = library.coordinates[library.index(name)]
+        for trait in traits:
+            held = [h for h in given.hold if space.index(trait) not in space.members(h)]
+            moved = [space.reach(z, {trait: step}, held) for step in steps]
+            label = trait if len(names) == 1 else f"{trait}: {name}"
+            rows[label] = [library.embedding.decode(one.z) for one in moved]
+            for one in moved:
+                if one.stopped:
+                    print(f"{name}: {one}")
+        if not traits:
+            rows[name] = [library[name]]
+    write_png(given.out, sheet(rows, columns, environment, given.size))
+    print(f"{given.out}: {len(rows)} rows")
+    return 0
 
 
 def _studio(given: argparse.Namespace) -> int:

@@ -49,7 +49,7 @@ from traitbrdf.quadrature import light_tree
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
-from traitbrdf.traits import GROUPS, TraitSpace, default_traits
+from traitbrdf.traits import GROUPS, Move, Trait, TraitSpace, default_traits
 from traitbrdf.transport import (
     Draft,
     PartFrame,
@@ -548,6 +548,7 @@ class EditSession:
         self._done: list[_Edit] = []
         self._undone: list[_Edit] = []
         self._replayed: list[_Said] = []
+        self._reached: dict[str, Move] = {}
 
     def __repr__(self) -> str:
         return f"EditSession({self.scene!r}, quality={self.quality!r}, {len(self._done)} edits)"
@@ -582,14 +583,15 @@ class EditSession:
         return TabulatedBRDF(grid, values, material.mirror, material.name or part)
 
     def plausibility(self, part: str) -> dict[str, float]:
-        """How far a part's material can be believed, as `report` has it: ``energy_scale`` and
-        ``gamut_margin``."""
+        """How far a part's material can be believed, as `report` has it: ``energy_scale``,
+        ``gamut_margin`` and ``plausibility``."""
         material = self.material(part)
         span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
         inside = (material.z - self.embedding.low_) / span
         return {
             "energy_scale": self._energy_scale(material),
             "gamut_margin": float(np.minimum(inside, 1.0 - inside).min()),
+            "plausibility": self.traits.plausibility(material.z),
         }
 
     def _energy_scale(self, material: Material) -> float:
@@ -658,14 +660,24 @@ class EditSession:
         values = np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
         return Material(z, table.mirror, self.embedding.residual(table, z), values, name)
 
-    def move(self, part: str | Iterable[str], hold: Iterable[str] = (), **amounts: float) -> None:
+    def move(
+        self,
+        part: str | Iterable[str],
+        hold: Iterable[str] = (),
+        photoreal: bool = True,
+        **amounts: float,
+    ) -> None:
         """Change traits of parts: ``edit.move("handle", shiny=0.6, hold=("colour",))``.
 
         Parameters
         ----------
         part : name or names of parts
         hold : traits, or the group "colour", whose scores shall stay
+        photoreal : whether to stay where materials of the library are near; `plausibility` says
+            how far a material is from that
         amounts : for each trait, how much its score shall change (1: typically low to high)
+
+        Where the gamut ends before that, the furthest is shown, and `reached` says how far it is.
 
         Raises
         ------
@@ -679,17 +691,35 @@ class EditSession:
         hold = (hold,) if isinstance(hold, str) else tuple(hold)
         with self._lock:
             # parts of one material stay so: they are decoded once
-            moved = {m: self._moved(m, amounts, hold) for m in map(self.material, names)}
-            new = {name: moved[self.material(name)] for name in names}
+            old = {name: self.material(name) for name in names}
+            moved = {m: self._moved(m, amounts, hold, photoreal) for m in old.values()}
+            new = {name: moved[old[name]][0] for name in names}
+            reached = {name: moved[old[name]][1] for name in names}
             target = part if isinstance(part, str) else names
             self._edited.update(new)
-            self._do(new, _Said(_move_call(target, amounts, hold)))
+            self._do(new, _Said(_move_call(target, amounts, hold, photoreal)), reached)
 
-    def _moved(self, old: Material, amounts: Mapping[str, float], hold: Iterable[str]) -> Material:
-        z = self.traits.move(old.z, amounts, hold)
-        if np.array_equal(z, old.z):
-            return old
-        return replace(old, z=z, table=None)
+    def _moved(
+        self,
+        old: Material,
+        amounts: Mapping[str, float],
+        hold: Iterable[str],
+        photoreal: bool = True,
+    ) -> tuple[Material, Move]:
+        found = self.traits.moved(old.z, amounts, hold, photoreal)
+        if np.array_equal(found.z, old.z):
+            return old, found
+        return replace(old, z=found.z, table=None), found
+
+    def reached(self, part: str) -> Move | None:
+        """What the last move or stroke came to on a part, while it is the last edit; else None."""
+        self.part(part)
+        return self._reached.get(part)
+
+    def add_trait(self, trait: Trait) -> None:
+        """Paint and move with a trait of one's own; it is saved with the design."""
+        with self._lock:
+            self.traits = self.traits.with_trait(trait, self.library)
 
     def paint(self, stroke: Stroke, only: str | Iterable[str] | None = None) -> dict[str, float]:
         """Paint a trait on the image: every part under the stroke moves by its share of it.
@@ -735,10 +765,12 @@ class EditSession:
             if hold is None:
                 hold = () if stroke.trait in GROUPS["colour"] else ("colour",)
             hold = tuple(hold)
-            new = {
+            found = {
                 name: self._moved(self.material(name), {stroke.trait: amount}, hold)
                 for name, amount in moved.items()
             }
+            new = {name: material for name, (material, _) in found.items()}
+            reached = {name: move for name, (_, move) in found.items()}
             held = "" if stroke.hold is None else f", hold={hold!r}"
             alone = ""
             if only is not None:
@@ -749,15 +781,18 @@ class EditSession:
                 f"amount={float(stroke.amount)!r}, radius={float(stroke.radius)!r}{held}){alone})",
                 "; ".join(_move_call(name, {stroke.trait: a}, hold) for name, a in moved.items()),
                 _framing(scene),
-            ))  # fmt: skip
+            ), reached)  # fmt: skip
         return moved
 
-    def _do(self, new: dict[str, Material], said: _Said) -> None:
+    def _do(
+        self, new: dict[str, Material], said: _Said, reached: dict[str, Move] | None = None
+    ) -> None:
         with self._lock:
             before = {part: self._materials[part] for part in new}
             self._done.append(_Edit(before, new, said))
             self._undone.clear()
             self._materials.update(new)
+            self._reached = {} if reached is None else reached
 
     def undo(self) -> bool:
         """Take the last edit back; False if there is none."""
@@ -767,6 +802,7 @@ class EditSession:
             edit = self._done.pop()
             self._materials.update(edit.before)
             self._undone.append(edit)
+            self._reached = {}
             return True
 
     def redo(self) -> bool:
@@ -777,6 +813,7 @@ class EditSession:
             edit = self._undone.pop()
             self._materials.update(edit.after)
             self._done.append(edit)
+            self._reached = {}
             return True
 
     @property
@@ -1271,7 +1308,9 @@ class EditSession:
         scores of its coordinates, ``energy_scale`` (the factor by which the table had to be
         lowered to reflect no more than all light: below 1 it shows less of its traits than the
         scores say), the largest directional albedo and how far the coordinates lie inside the
-        gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts).
+        gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts), and the share
+        of the library that is less plausible (``plausibility``). ``move`` says what the last edit
+        asked of a part and what it came to.
 
         Tiers: "basis"; "trained", the same after exact images were taken into the part's basis;
         "exact", without the basis. ``exact_frames`` counts those, ``trained_images`` what the
@@ -1323,6 +1362,7 @@ class EditSession:
             "scores": self.traits.score(material.z),
             "max_albedo": self.brdf(part).max_albedo(),
             **self.plausibility(part),
+            "move": None if part not in self._reached else str(self._reached[part]),
         }
 
     def _left_out(self, view: _View, transport: Transport) -> dict[str, Any]:
@@ -1431,6 +1471,8 @@ class EditSession:
             "error": self.error,
             "seed": self.seed,
         }
+        if self.traits is not default_traits():
+            arrays |= {f"traits_{name}": value for name, value in self.traits.arrays().items()}
         arrays["design"] = np.array(json.dumps(header))
         write_arrays(path, arrays)
 
@@ -1460,6 +1502,12 @@ class EditSession:
             given = {key: header[key] for key in ("quality", "error", "seed")}
             # what is wrong in the file is no mistake of the caller
             cls(scene, **given, cache=False)
+        with _design_errors(path):
+            own = {k.removeprefix("traits_"): v for k, v in arrays.items() if "traits_" in k[:7]}
+            if own:
+                box = default_traits()
+                own |= {"low": box.low, "high": box.high}
+                given["traits"] = TraitSpace.from_arrays(own)
         session = cls(scene, **{**given, **settings})
         with _design_errors(path):
             expected = _fingerprint(session.embedding)
@@ -1557,10 +1605,16 @@ def _framing(scene: Scene) -> tuple[Camera, int, int]:
     return scene.camera, scene.height, scene.width
 
 
-def _move_call(part: str | list[str], amounts: Mapping[str, float], hold: tuple[str, ...]) -> str:
+def _move_call(
+    part: str | list[str],
+    amounts: Mapping[str, float],
+    hold: tuple[str, ...],
+    photoreal: bool = True,
+) -> str:
     said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
     held = f", hold={hold!r}" if hold else ""
-    return f"edit.move({part!r}{said}{held})"
+    freely = "" if photoreal else ", photoreal=False"
+    return f"edit.move({part!r}{said}{held}{freely})"
 
 
 def _enlarged(image: Float32, height: int, width: int) -> Float32:

@@ -780,6 +780,13 @@ class BRDFEmbedding:
         row = self.components_[body].mean(axis=0).astype(np.float64)
         return np.asarray(OPPONENT @ (row @ self._mixing), np.float64)
 
+    def log_rows(self, cells: ArrayLike) -> tuple[Float64, Float64]:
+        """(3, n, k) rows and (n,) constants: log(f + FLOOR) at cells of `grid_`, before `profiles`
+        and the energy check, is ``rows @ z + constants``."""
+        at = self._cell_indices(cells)
+        rows = np.einsum("nm,cmk->cnk", self.components_[at].astype(np.float64), self._mixing)
+        return rows, self.mean_[at].astype(np.float64)
+
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
         """The table at coordinates `z` (k,), on the embedding's grid or any other."""
         values = self.decode_values(z).reshape(*self.grid_.shape, 3)
