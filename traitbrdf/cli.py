@@ -372,6 +372,7 @@ def _gallery(given: argparse.Namespace) -> int:
     for name in traits:
         space.index(name)
     environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
+    given.out.parent.mkdir(parents=True, exist_ok=True)  # rather than fail after the work
     rows, columns = {}, [f"{step:+.2f}" for step in steps] if traits else []
     for name in names:
         z = library.coordinates[library.index(name)]

@@ -756,11 +756,8 @@ class TraitSpace:
                 at = at if exact is None else exact
         stopped = ""
         if way < whole:
-            stopped = (
-                "the gamut of plausible materials ends here"
-                if photoreal
-                else ("the gamut ends here")
-            )
+            kind = "gamut of plausible materials" if photoreal else "gamut"
+            stopped = f"the {kind} ends here"
             if way >= end:
                 stopped = "no material of the library goes further"
             elif way < 1e-3 * min(whole, 1.0) and not task.possible(at):
