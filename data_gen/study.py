@@ -27,6 +27,7 @@ from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.descriptors import DESCRIPTORS
 from traitbrdf.embedding import FLOOR, GRID, OPPONENT, default_library
 from traitbrdf.formats import encode_srgb
+from traitbrdf.gallery import own_colours
 from traitbrdf.lights import EnvironmentMap
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.scene import Scene
@@ -196,8 +197,8 @@ class Spheres:
         columns = np.concatenate([f.T for f in materials], axis=1).astype(np.float32)
         found = []
         for operator in self._operators[grid]:
-            image = operator.part_images(0, columns).reshape(-1, 3, len(materials), 3)
-            found.append(np.einsum("pcbc->bpc", image).astype(np.float64))
+            images = own_colours(operator.part_images(0, columns))
+            found.append(images.swapaxes(0, 1).astype(np.float64))
         return found
 
     def compare(self, true: Sequence[Float64], shown: Sequence[Float64]) -> dict[str, float]:

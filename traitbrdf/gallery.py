@@ -18,7 +18,7 @@ from traitbrdf.shapes import sphere
 
 Float32 = NDArray[np.float32]
 
-_PAPER = 0.82  # sRGB of what is around the spheres
+_PAPER = 209  # sRGB byte of what is around the spheres
 _LINE = 15  # pixels of a line of text
 
 
@@ -82,11 +82,11 @@ def sheet(
     lit = images.max(axis=-1) > 0.0
     exposure = exposure_of(images[lit][None]) if lit.any() else 1.0
     shown = tone_map(images, exposure)
-    shown[~lit] = round(255 * _PAPER)
+    shown[~lit] = _PAPER
     wide = max(len(row) for row in rows.values())
     margin = 8 + 7 * max(len(label) for label in rows)
     top = _LINE if columns else 0
-    paper = Image.new("RGB", (margin + wide * size, top + len(rows) * size), (209, 209, 209))
+    paper = Image.new("RGB", (margin + wide * size, top + len(rows) * size), (_PAPER,) * 3)
     draw = ImageDraw.Draw(paper)
     for j, label in enumerate(columns):
         draw.text((margin + (j + 0.5) * size, 1), label, fill=(0, 0, 0), anchor="ma")

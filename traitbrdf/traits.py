@@ -205,7 +205,6 @@ def _interpolated(values: Any, used: Any, at: Any, grade: Any) -> Any:
 
 _FIRST = READINGS.index("profile 0")
 _HIGHLIGHT = sum(theta <= 30.0 for theta in PROFILE)
-_CORE = list(range(_FIRST, _FIRST + _HIGHLIGHT))
 """Readings of the highlight, within which decoding leaves no hole (`traitbrdf.profiles`)."""
 
 
@@ -224,13 +223,9 @@ class Readings(NamedTuple):
 
     def at(self, z: Float64) -> Float64:
         """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
-        logs = np.einsum("cnk,...k->...nc", self.rows, z) + self.mean[:, None]
-        f: Float64 = np.maximum(np.exp(np.minimum(logs, 30.0)) - FLOOR, 0.0)
-        found: Float64 = np.matmul(self.weights, f)
-        core = np.maximum.accumulate(found[..., _CORE[::-1], :], axis=-2)
-        found[..., _CORE, :] = core[..., ::-1, :]
-        brightest = found[..., :1, :].max(axis=-1, keepdims=True)
-        return np.asarray(found / np.maximum(brightest, 1.0))
+        points = np.ascontiguousarray(z, np.float64).reshape(-1, z.shape[-1])
+        found = [self.near(point, False).readings for point in points]
+        return np.reshape(found, (*z.shape[:-1], len(self.weights), 3))
 
     def near(self, z: Float64, sloped: bool = True) -> Near:
         """All that a move asks of a point z (k,)."""
@@ -801,21 +796,16 @@ class TraitSpace:
             least = min(limit, self.density.log(inside))
         coloured = any(self.names[i] in COLOURFUL for i in moved)
         strictly = "colour" in hold or "color" in hold
-        hole = math.inf
-        if photoreal and self.optics is not None:
-            hole = max(_HOLE, self._read(inside)[2])
-        score = self.scores(inside)
+        score, columns, pit = self._read(inside)
+        hole = max(_HOLE, pit) if photoreal and self.optics is not None else math.inf
+        hues = None
+        if self.optics is not None and (strictly or not coloured):
+            hues = _Hues(_chroma(columns)[0])
         return _Task(
             self, fixed, rates, score[fixed], soft, score[soft],
             hard_body, hard_body @ inside, kept, kept @ inside,
-            self._hues(inside) if strictly or not coloured else None, least,
-            strictly_hued=strictly, hole=hole,
+            hues, least, strictly_hued=strictly, hole=hole,
         )  # fmt: skip
-
-    def _hues(self, z: Float64) -> _Hues | None:
-        if self.optics is None:
-            return None
-        return _Hues(_chroma(describe_columns(self.optics.readings.at(z)))[0])
 
     def _said(
         self, start: Float64, z: Float64, moved: Mapping[int, float], held: list[int], stopped: str
@@ -1177,14 +1167,7 @@ def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> F
     ValueError
         If labels are of one class only, of a wrong shape, or others than -1, 0 and 1.
     """
-    label = np.asarray(labels)
-    if label.shape != (len(z),) or not np.isin(label, (-1, 0, 1)).all():
-        raise ValueError(
-            f"labels of {name!r}: expected ({len(z)},) values of -1, 0 or 1, "
-            f"got shape {label.shape}"
-        )
-    if not ((label == 1).any() and (label == -1).any()):
-        raise ValueError(f"labels of {name!r}: expected members with and without it")
+    label = _as_labels(labels, len(z), name)
     if means:
         return np.asarray(z[label == 1].mean(axis=0) - z[label == -1].mean(axis=0))
     from sklearn.svm import LinearSVC  # slow to import, and needed only here
@@ -1193,6 +1176,19 @@ def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> F
     clear = label != 0
     machine = LinearSVC(C=0.1, dual=False).fit(z[clear] / scale, label[clear])
     return np.asarray(machine.coef_[0] / scale, np.float64)
+
+
+def _as_labels(labels: ArrayLike, count: int, name: str) -> NDArray[Any]:
+    """Labels (count,) of -1, 0 and 1, of both classes."""
+    label = np.asarray(labels)
+    if label.shape != (count,) or not np.isin(label, (-1, 0, 1)).all():
+        raise ValueError(
+            f"labels of {name!r}: expected ({count},) values of -1, 0 or 1, "
+            f"got shape {label.shape}: {label!r}"
+        )
+    if not ((label == 1).any() and (label == -1).any()):
+        raise ValueError(f"labels of {name!r}: expected materials with and without it")
+    return label
 
 
 def _rank_correlations(raw: Float64) -> Float64:
@@ -1262,13 +1258,7 @@ class Trait:
             and 1, shapes that do not match, or materials labelled both ways.
         """
         z = _as_points(materials, library)
-        given = np.asarray(labels)
-        if given.shape != (len(z),) or not np.isin(given, (-1, 0, 1)).all():
-            raise ValueError(
-                f"labels of {name!r}: expected ({len(z)},) values of -1, 0 or 1, got {given!r}"
-            )
-        if not ((given == 1).any() and (given == -1).any()):
-            raise ValueError(f"labels of {name!r}: expected materials with and without it")
+        given = _as_labels(labels, len(z), name)
         for i, point in enumerate(z):
             same = np.all(np.abs(z - point) < 1e-9, axis=1)
             if given[i] * given[same].min() < 0 or given[i] * given[same].max() < 0:
