@@ -16,7 +16,8 @@ from data_gen.labels import TRAITS, grading, labels
 from data_gen.tables import Progress, Tables
 from traitbrdf.descriptors import READINGS, describe, read, reading_rows
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
-from traitbrdf.traits import Grades, Optics, Readings, TraitSpace
+from traitbrdf.moves import Grades, Optics, Readings
+from traitbrdf.traits import TraitSpace
 
 COUNT = 2040
 SEED = 0

@@ -17,7 +17,7 @@ FLOORS = (
     ("models", "brdf", "measured", "lights", "shapes"),
     ("profiles", "descriptors"),
     ("embedding", "strokes", "scene"),
-    ("reference", "quadrature"),
+    ("reference", "quadrature", "moves"),
     ("transport", "fitting", "gallery"),
     ("traits",),
     ("editing",),
@@ -34,7 +34,7 @@ HOMES = {
     "sklearn": {"embedding", "traits"},
     "embreex": {"shapes"},
     "trimesh": {"shapes"},
-    "numba": {"descriptors", "profiles", "quadrature", "traits"},
+    "numba": {"descriptors", "moves", "profiles", "quadrature"},
 }
 """Where else's package may be imported."""
 

@@ -234,7 +234,7 @@ def describe(readings: ArrayLike) -> dict[str, Float64]:
 
 def describe_columns(readings: Float64) -> Float64:
     """`describe` as one array (..., len(DESCRIPTORS))."""
-    found = _formulas(np.ascontiguousarray(readings.reshape(-1, *readings.shape[-2:])))
+    found = formulas(np.ascontiguousarray(readings.reshape(-1, *readings.shape[-2:])))
     return np.asarray(found).reshape(*readings.shape[:-2], len(DESCRIPTORS))
 
 
@@ -247,7 +247,7 @@ _LOG_WIDE = math.log(math.pi / 4)
 
 
 @numba.njit(cache=True, nogil=True)
-def _formulas(readings: Any) -> Any:
+def formulas(readings: Any) -> Any:
     """`DESCRIPTORS` (m, n) of readings (m, len(READINGS), 3), in their order.
 
     Compiled: a move of a trait reads them some hundred times.

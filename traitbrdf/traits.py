@@ -4,13 +4,11 @@ A trait is a smooth score on coordinates. The shipped ones grade physical descri
 (`traitbrdf.descriptors`) by how common their values are among the members of the library, and add
 them up; they are had of the coordinates by the few cells that they read. Straight traits are the
 normal of a linear support vector machine between members that have the trait and members that do
-not, or the difference of their means (Matusik et al. 2003). Scores are
-scaled so that the 10th percentile of the library has 0 and the 90th has 1.
+not, or the difference of their means (Matusik et al. 2003). Scores are scaled so that the 10th
+percentile of the library has 0 and the 90th has 1.
 
-A move changes scores by given amounts along a path, exactly, and holds others. Among all ways to do
-so it takes the one that is most like what real materials do (shortest by a covariance of the
-library) and that changes other traits least. It ends where the library ends: at the wall of the
-box, or where no member is near (`Density`).
+A move changes scores by given amounts along a path, exactly, and holds others (`traitbrdf.moves`).
+It ends where the library ends: at the wall of the box, or where no member is near (`Density`).
 """
 
 from __future__ import annotations
@@ -20,29 +18,29 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from traitbrdf.descriptors import (
-    DESCRIPTORS,
-    LUMINANCE,
-    PROFILE,
-    READINGS,
-    describe_columns,
-    descriptors,
-)
-from traitbrdf.embedding import (
-    FLOOR,
-    BRDFEmbedding,
-    Library,
-    default_embedding,
-    default_library,
-)
+from traitbrdf.descriptors import describe_columns, descriptors
+from traitbrdf.embedding import BRDFEmbedding, Library, default_embedding, default_library
 from traitbrdf.formats import artifact, unknown_name
+from traitbrdf.moves import (
+    PALE,
+    STRIDE,
+    Density,
+    Grades,
+    Ground,
+    Optics,
+    Readings,
+    Task,
+    chromas,
+    compromise,
+    follow,
+    possible,
+)
 
 if TYPE_CHECKING:
     from traitbrdf.brdf import TabulatedBRDF
@@ -71,236 +69,7 @@ PLAUSIBLE = 0.01
 _EXTREMES = (1.0, 99.0)  # percentiles of the library that no photoreal move goes beyond
 _BETWEEN = 0.05  # what differences between families count in the metric of moves
 _RIDGE = 1e-3  # of the mean variance: keeps the metric regular where the library is flat
-_STEP = 0.5  # in scores: how far a move goes before it looks again
-_EXACT = 1e-5  # how near a score is brought
-_NEAR = 2e-3  # how near is near enough where a score has a kink
-_APART = 10.0  # what a change of unrelated scores costs, beside the metric
-_BODY = 30.0  # what a change of the body costs, where it is kept
-_HUE = 10.0  # what a unit of a* or b* costs, where colour is held
 _HOLE = 0.05  # log f by which the middle of a highlight may be darker than what is around it
-_TURN = 1.5  # degrees that hues may turn then
-
-
-class Density(NamedTuple):
-    """Where the library is: a mixture of Gaussians, one for each family and a wide one.
-
-    Parameters
-    ----------
-    means : (c, k)
-    whiten : (c, k, k), lower factors: whiten[i] @ (z - means[i]) has unit covariance
-    logs : (c,) log of weight over volume
-    known : (101,) log densities of the library's percentiles 0 to 100
-    """
-
-    means: Float64
-    whiten: Float64
-    logs: Float64
-    known: Float64
-
-    @classmethod
-    def fit(cls, z: Float64, families: Sequence[str]) -> Density:
-        kinds = np.asarray(families)
-        k = z.shape[1]
-        names = np.unique(kinds)
-        within = np.zeros((k, k))
-        for kind in names:
-            within += np.cov(z[kinds == kind].T, ddof=0) * np.sum(kinds == kind) / len(z)
-        groups = [(0.95 / len(names), z[kinds == kind]) for kind in names] + [(0.05, z)]
-        means, whiten, logs = [], [], []
-        for weight, members in groups:
-            # a family's own shape, drawn towards that of all: 60 members say little of 24 axes
-            cov = 0.6 * np.cov(members.T, ddof=0) + 0.4 * within + 1e-2 * np.eye(k)
-            factor = np.linalg.inv(np.linalg.cholesky(cov))
-            means.append(members.mean(axis=0))
-            whiten.append(factor)
-            logs.append(math.log(weight) + float(np.sum(np.log(np.diag(factor)))))
-        found = cls(np.array(means), np.array(whiten), np.array(logs), np.zeros(101))
-        own = np.array([found.log(point) for point in z])
-        return found._replace(known=np.percentile(own, np.arange(101.0)))
-
-    def log(self, z: Float64) -> float:
-        """log density at z (k,), to a constant."""
-        return self.slope(z)[0]
-
-    def slope(self, z: Float64) -> tuple[float, Float64]:
-        """log density at z (k,) and its gradient."""
-        away = np.matmul(self.whiten, (z - self.means)[:, :, None])[:, :, 0]
-        each = self.logs - 0.5 * np.sum(away * away, axis=1)
-        top = float(each.max())
-        share = np.exp(each - top)
-        total = float(share.sum())
-        pull = np.matmul(away[:, None, :], self.whiten)[:, 0]
-        return top + math.log(total), -(share @ pull) / total
-
-
-class Grades(NamedTuple):
-    """How common a descriptor's value is in the library, as a number of standard deviations.
-
-    Parameters
-    ----------
-    names : descriptors
-    at, grade : (d, m) values and their grades, both ascending; straight on beyond the ends
-    """
-
-    names: tuple[str, ...]
-    at: Float64
-    grade: Float64
-
-    @classmethod
-    def fit(cls, values: Mapping[str, ArrayLike], knots: int = 65) -> Grades:
-        from scipy.interpolate import PchipInterpolator
-        from scipy.special import ndtri
-
-        share = np.linspace(0.02, 0.98, 17)
-        at, grade = [], []
-        for column in values.values():
-            x = np.quantile(np.asarray(column, np.float64), share)
-            # many members share a value (no tint at all): their grades are one
-            gap = 0.03 * max(float(x[-2] - x[1]), 1e-6)
-            place = np.unique(np.floor((x - x[0]) / gap), return_inverse=True)[1]
-            count = np.bincount(place)
-            kept = np.bincount(place, x) / count
-            level = np.bincount(place, ndtri(share)) / count
-            if len(kept) == 1:
-                kept, level = np.append(kept, kept + gap), np.append(level, level + 0.1)
-            even = np.linspace(kept[0], kept[-1], knots)
-            between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, len(kept)), kept)
-            fine = 0.5 * (even + between)
-            at.append(fine)
-            grade.append(PchipInterpolator(kept, level)(fine))
-        return cls(tuple(values), np.array(at), np.array(grade))
-
-    def of(self, descriptors: Float64) -> Float64:
-        """Grades (..., d) of all of `descriptors.DESCRIPTORS` (..., n), in their order."""
-        used = np.array([_ORDER[name] for name in self.names])
-        flat = np.ascontiguousarray(descriptors.reshape(-1, descriptors.shape[-1]))
-        found = _interpolated(flat, used, self.at, self.grade)
-        return np.asarray(found).reshape(*descriptors.shape[:-1], len(used))
-
-
-_ORDER = {name: i for i, name in enumerate(DESCRIPTORS)}
-
-
-@numba.njit(cache=True, nogil=True)
-def _interpolated(values: Any, used: Any, at: Any, grade: Any) -> Any:
-    """Columns `used` of values (m, n), each along its own knots, and straight on beyond them."""
-    out = np.empty((len(values), len(used)))
-    last = at.shape[1] - 1
-    for j in range(len(used)):
-        x, y = at[j], grade[j]
-        end = max(last // 8, 1)
-        below = (y[end] - y[0]) / (x[end] - x[0])
-        above = (y[last] - y[last - end]) / (x[last] - x[last - end])
-        for m in range(len(values)):
-            v = values[m, used[j]]
-            if v <= x[0]:
-                out[m, j] = y[0] + below * (v - x[0])
-            elif v >= x[last]:
-                out[m, j] = y[last] + above * (v - x[last])
-            else:
-                i = min(max(np.searchsorted(x, v, side="right") - 1, 0), last - 1)
-                out[m, j] = y[i] + (y[i + 1] - y[i]) * (v - x[i]) / (x[i + 1] - x[i])
-    return out
-
-
-_FIRST = READINGS.index("profile 0")
-_HIGHLIGHT = sum(theta <= 30.0 for theta in PROFILE)
-"""Readings of the highlight, within which decoding leaves no hole (`traitbrdf.profiles`)."""
-
-
-class Readings(NamedTuple):
-    """What `descriptors.READINGS` need of an embedding: few cells.
-
-    Parameters
-    ----------
-    rows, mean : (3, cells, k) and (cells,), log(f + FLOOR) of a channel: rows @ z + mean
-    weights : (readings, cells)
-    """
-
-    rows: Float64
-    mean: Float64
-    weights: Float64
-
-    def at(self, z: Float64) -> Float64:
-        """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
-        points = np.ascontiguousarray(z, np.float64).reshape(-1, z.shape[-1])
-        found = [self.near(point, False).readings for point in points]
-        return np.reshape(found, (*z.shape[:-1], len(self.weights), 3))
-
-    def near(self, z: Float64, sloped: bool = True) -> Near:
-        """All that a move asks of a point z (k,)."""
-        return Near(*_near(z, self.rows, self.mean, self.weights, sloped))
-
-
-class Near(NamedTuple):
-    """Readings (readings, 3) at a point and their slopes (readings, 3, k); by how much (log f) the
-    middle of the highlight is darker there than what is around it, before decoding mends it, and
-    its slope (k,)."""
-
-    readings: Float64
-    slopes: Float64
-    hole: float
-    inward: Float64
-
-
-@numba.njit(cache=True, nogil=True)
-def _near(z: Any, rows: Any, mean: Any, weights: Any, sloped: Any) -> Any:
-    """`Near` of a point; slopes are 0 if they are not wanted."""
-    count, cells = weights.shape
-    value, slopes = np.zeros((count, 3)), np.zeros((count, 3, len(z)))
-    raised = np.empty((3, cells))
-    for c in range(3):
-        for n in range(cells):
-            log = mean[n]
-            for k in range(len(z)):
-                log += rows[c, n, k] * z[k]
-            raised[c, n] = math.exp(min(log, 30.0))
-    for i in range(count):
-        for n in range(cells):
-            weight = weights[i, n]
-            if weight != 0.0:
-                for c in range(3):
-                    value[i, c] += weight * max(raised[c, n] - FLOOR, 0.0)
-                    if sloped:
-                        for k in range(len(z)):
-                            slopes[i, c, k] += weight * raised[c, n] * rows[c, n, k]
-    top, most = _FIRST, -1.0
-    for i in range(_FIRST, count):
-        light = 0.0
-        for c in range(3):
-            light += LUMINANCE[c] * value[i, c]
-        if light > most:
-            top, most = i, light
-    middle = 0.0
-    for c in range(3):
-        middle += LUMINANCE[c] * value[_FIRST, c]
-    hole = math.log((most + FLOOR) / (middle + FLOOR))
-    inward = np.zeros(len(z))
-    for c in range(3):
-        inward += LUMINANCE[c] * (slopes[top, c] / (most + FLOOR))
-        inward -= LUMINANCE[c] * (slopes[_FIRST, c] / (middle + FLOOR))
-    # no hole in the highlight: as high as what follows, of which it then has the slope too
-    for i in range(_FIRST + _HIGHLIGHT - 2, _FIRST - 1, -1):
-        for c in range(3):
-            if value[i, c] < value[i + 1, c]:
-                value[i, c] = value[i + 1, c]
-                slopes[i, c] = slopes[i + 1, c]
-    brightest = np.argmax(value[0])
-    whole = value[0, brightest]
-    if whole > 1.0:  # no more light than there was
-        by = slopes[0, brightest] / whole
-        for i in range(count):
-            for c in range(3):
-                slopes[i, c] = (slopes[i, c] - value[i, c] * by) / whole
-                value[i, c] /= whole
-    return value, slopes, hole, inward
-
-
-class Optics(NamedTuple):
-    """What lets scores be read off descriptors: where they are read, and how they are graded."""
-
-    readings: Readings
-    grades: Grades
 
 
 @dataclass(frozen=True)
@@ -368,11 +137,11 @@ class Explanation:
         ):
             lines.append(f"{what}: {before:.3g} to {after:.3g}{unit}")
         for kind in ("diffuse", "specular"):
-            hues, chromas = d[f"{kind}_hue"], d[f"{kind}_chroma"]
-            if max(chromas) >= _PALE:
+            hues, chroma = d[f"{kind}_hue"], d[f"{kind}_chroma"]
+            if max(chroma) >= PALE:
                 lines.append(
                     f"{kind} hue: {hues[0]:.0f} to {hues[1]:.0f} degrees, "
-                    f"chroma {chromas[0]:.0f} to {chromas[1]:.0f}"
+                    f"chroma {chroma[0]:.0f} to {chroma[1]:.0f}"
                 )
         before, after = self.plausibility
         lines.append(f"plausibility: {before:.2f} to {after:.2f}")
@@ -468,7 +237,10 @@ class TraitSpace:
             other: name for name, (_, others) in self.about.items() for other in others
         }
         metric = self.covariance + _RIDGE * np.trace(self.covariance) / k * np.eye(k)
-        self._stiffness = np.linalg.inv(metric)
+        self._ground = Ground.of(
+            optics, self.weights, self.normals, self.typical[:, 0], self._span,
+            np.linalg.inv(metric), self.low, self.high, density,
+        )  # fmt: skip
 
     @classmethod
     def fit(
@@ -574,39 +346,8 @@ class TraitSpace:
     def _raw(self, z: Float64) -> Float64:
         raw: Float64 = z @ self.normals.T
         if self.optics is not None:
-            raw = raw + self._graded(describe_columns(self.optics.readings.at(z)))
+            raw = raw + self.grades(z) @ self.weights.T
         return raw
-
-    def _graded(self, columns: Float64) -> Float64:
-        """What descriptors (..., n) add to raw scores (..., t)."""
-        assert self.optics is not None
-        added: Float64 = self.optics.grades.of(columns) @ self.weights.T
-        return added
-
-    def _read(self, z: Float64) -> tuple[Float64, Float64, float]:
-        """Scores (t,) at z (k,), descriptors (n,) and `Near.hole`, 0 and none without optics."""
-        raw, columns, hole = self.normals @ z, np.zeros(0), 0.0
-        if self.optics is not None:
-            near = self.optics.readings.near(z, False)
-            columns, hole = describe_columns(near.readings), near.hole
-            raw = raw + self._graded(columns)
-        return (raw - self.typical[:, 0]) / self._span, columns, hole
-
-    def _sloped(self, z: Float64) -> tuple[Float64, Float64, Float64, float, Float64]:
-        """Scores (t,) at z (k,), their gradients (t, k), descriptors (k + 1, n) at z and one small
-        step (`_SMALL`) along each coordinate, and `Near.hole` and `Near.inward`."""
-        raw, slopes, columns = self.normals @ z, self.normals, np.zeros((len(z) + 1, 0))
-        hole, inward = 0.0, np.zeros(len(z))
-        if self.optics is not None:
-            readings, by_z, hole, inward = self.optics.readings.near(z)
-            # formulas of a few numbers: cheaper once more than their slopes
-            steps = readings + _SMALL * np.moveaxis(by_z, -1, 0)
-            columns = describe_columns(np.concatenate([readings[None], steps]))
-            added = self._graded(columns)
-            raw = raw + added[0]
-            slopes = slopes + (added[1:] - added[0]).T / _SMALL
-        score = (raw - self.typical[:, 0]) / self._span
-        return score, slopes / self._span[:, None], columns, hole, inward
 
     def plausibility(self, z: ArrayLike) -> float:
         """The share of the library that lies in less likely places than z (k,): 0 is unheard of.
@@ -733,37 +474,24 @@ class TraitSpace:
             return self._said(start, start.copy(), moved, held, "")
         task = self._task(start, moved, held, hold, photoreal)
         whole = max(abs(value) for value in moved.values())
-        at, way = np.clip(start, self.low, self.high), 0.0
-        room = self._room(at, moved) if photoreal else whole
+        room = self._room(np.clip(start, self.low, self.high), moved) if photoreal else whole
         end = min(whole, room)
-        # first all that had better stay does; where that ends, less and less of it
-        for more in task.relaxed():
-            stride, least = (_STEP, 0.2 * _STEP) if more.strict else (0.5 * _STEP, 0.05 * _STEP)
-            while way < end and stride > least:
-                goal = min(way + stride, end)
-                step = more.towards(at, goal, goal == end)
-                if step is None:
-                    stride *= 0.25 if more.strict else 0.5
-                else:
-                    at, way, stride = step, goal, min(2.0 * stride, _STEP)
-            if 0.0 < way < end:  # a step on the way is not as exact as the last
-                exact = more.towards(at, way, True)
-                at = at if exact is None else exact
+        at, way = follow(self._ground, task, start, end)
         stopped = ""
         if way < whole:
             kind = "gamut of plausible materials" if photoreal else "gamut"
             stopped = f"the {kind} ends here"
             if way >= end:
                 stopped = "no material of the library goes further"
-            elif way < 1e-3 * min(whole, 1.0) and not task.possible(at):
+            elif way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
                 stopped = "held traits forbid it"
-                at = task.compromise(at, min(_STEP, whole))
+                at = compromise(self._ground, task, at, min(STRIDE, whole))
         return self._said(start, at, moved, held, stopped)
 
     def _room(self, z: Float64, moved: Mapping[int, float]) -> float:
         """How far a move may go until a score leaves what the library has."""
         whole = max(abs(value) for value in moved.values())
-        score, room = self.scores(z), math.inf
+        score, room = self._ground.look(z)[0], math.inf
         for i, value in moved.items():
             rate = value / whole
             if abs(rate) > 1e-9:
@@ -778,15 +506,15 @@ class TraitSpace:
         held: list[int],
         hold: tuple[str, ...],
         photoreal: bool,
-    ) -> _Task:
+    ) -> Task:
         whole = max(abs(value) for value in moved.values())
-        fixed = [*moved, *held]
+        fixed = np.array([*moved, *held], np.int64)
         rates = np.array([*(value / whole for value in moved.values()), *([0.0] * len(held))])
         known = np.abs(self.related[list(moved)])
         apart = np.flatnonzero((known < RELATED).all(axis=0))
         soft = np.setdiff1d(apart, fixed)
         inside = np.clip(start, self.low, self.high)
-        hard_body = self.body if "body" in hold else self.body[:0]
+        body = self.body if "body" in hold else self.body[:0]
         keeps = "body" not in hold and any(self.names[i] in KEEPS_BODY for i in moved)
         kept = self.body if keeps else self.body[:0]
         least = -math.inf
@@ -796,21 +524,18 @@ class TraitSpace:
             least = min(limit, self.density.log(inside))
         coloured = any(self.names[i] in COLOURFUL for i in moved)
         strictly = "colour" in hold or "color" in hold
-        score, columns, pit = self._read(inside)
+        score, columns, pit = self._ground.look(inside)
         hole = max(_HOLE, pit) if photoreal and self.optics is not None else math.inf
-        hues = None
-        if self.optics is not None and (strictly or not coloured):
-            hues = _Hues(_chroma(columns)[0])
-        return _Task(
-            self, fixed, rates, score[fixed], soft, score[soft],
-            hard_body, hard_body @ inside, kept, kept @ inside,
-            hues, least, strictly_hued=strictly, hole=hole,
+        hued = self.optics is not None and (strictly or not coloured)
+        return Task(
+            fixed, rates, score[fixed], soft, score[soft], body, body @ inside, kept,
+            kept @ inside, hued, chromas(columns), strictly, least, hole,
         )  # fmt: skip
 
     def _said(
         self, start: Float64, z: Float64, moved: Mapping[int, float], held: list[int], stopped: str
     ) -> Move:
-        change = self.scores(z) - self.scores(start)
+        change = self._ground.look(z)[0] - self._ground.look(start)[0]
         return Move(
             z,
             {self.names[i]: value for i, value in moved.items()},
@@ -918,244 +643,6 @@ class TraitSpace:
             state["low"], state["high"], state["body"], optics, state["trait_weights"],
             state["trait_related"], density, about, state["trait_limits"],
         )  # fmt: skip
-
-
-class _Slopes(NamedTuple):
-    """Around a point: gradients of scores (t, k), of colours (4, k) and of the hole (k,), and the
-    stiffness (k, k) of what had better stay."""
-
-    scores: Float64
-    hues: Float64
-    stiff: Float64
-    inward: Float64
-
-
-class _Hues(NamedTuple):
-    """The hues that a move keeps, of body and lobe; what has none keeps its chroma.
-
-    Parameters
-    ----------
-    kept : (2, 2) a* and b* of the body and of the lobe
-    """
-
-    kept: Float64
-
-    def turned(self, colours: Float64, sure: Float64) -> Float64:
-        """Of `_chroma` what shall stay 0 (..., 4): a* and b* across the kept hue, and along it for
-        what is pale."""
-        chroma = np.hypot(self.kept[:, 0], self.kept[:, 1])
-        along = self.kept / np.maximum(chroma, 1e-9)[:, None]
-        beside = colours[..., 1] * along[:, 0] - colours[..., 0] * along[:, 1]
-        ahead = np.sum(colours * along, axis=-1) - chroma
-        pale = np.clip(1.0 - chroma / (2.0 * _PALE), 0.0, 1.0)
-        # a colour that fades stops short of turning into its opposite
-        faded = np.minimum(ahead + 0.6 * chroma, 0.0)
-        return np.concatenate([sure * beside, sure * (pale * ahead + faded)], axis=-1)
-
-    def off(self, colours: Float64, sure: Float64) -> float:
-        """Of `_chroma`, by how many degrees hues are off, as far as there are hues."""
-        now, then = (c[..., 0] + 1j * c[..., 1] for c in (colours, self.kept))
-        seen = np.minimum(np.minimum(np.abs(now), np.abs(then)) / _PALE, 1.0)
-        return float((np.degrees(np.abs(np.angle(then * now.conj()))) * seen * sure).max())
-
-
-_SMALL = 1e-5
-_PALE = 5.0  # C*ab: paler colours have no hue to speak of
-_DARK = 0.006  # albedo of a body or lobe that has none either
-
-
-def _chroma(columns: Float64) -> tuple[Float64, Float64]:
-    """a* and b* (..., 2, 2) of body and lobe, of descriptors (..., n), and how much there is of
-    both (..., 2): 0 nothing to see a hue of, 1 enough."""
-    colours, sure = _colours(np.atleast_2d(columns))
-    return (colours[0], sure[0]) if columns.ndim == 1 else (colours, sure)
-
-
-_HUES = np.array([_ORDER["diffuse_hue"], _ORDER["specular_hue"]])
-_CHROMAS = np.array([_ORDER["diffuse_chroma"], _ORDER["specular_chroma"]])
-_DIFFUSE, _CONTRAST = _ORDER["diffuse"], _ORDER["highlight"]
-
-
-@numba.njit(cache=True, nogil=True)
-def _colours(columns: Any) -> Any:
-    colours, sure = np.empty((len(columns), 2, 2)), np.empty((len(columns), 2))
-    for m in range(len(columns)):
-        row = columns[m]
-        # contrast: difference of the cube roots of radiance factors, of which the body's is diffuse
-        body = row[_DIFFUSE]
-        lobe = (row[_CONTRAST] + np.cbrt(body)) ** 3 - body
-        sure[m, 0] = min(max(body / _DARK - 1.0, 0.0), 1.0)
-        sure[m, 1] = min(max(lobe / (_DARK + 0.5 * body) - 1.0, 0.0), 1.0)
-        for i in range(2):
-            angle, chroma = math.radians(row[_HUES[i]]), row[_CHROMAS[i]]
-            colours[m, i, 0], colours[m, i, 1] = chroma * math.cos(angle), chroma * math.sin(angle)
-    return colours, sure
-
-
-class _Task(NamedTuple):
-    """One move: scores to bring to where they shall be, and what shall stay."""
-
-    space: TraitSpace
-    fixed: list[int]  # scores that are moved or held
-    rates: Float64  # how they change along the move
-    start: Float64  # what they were
-    soft: NDArray[np.int64]  # scores that had better stay
-    soft_start: Float64
-    body: Float64  # rows that stay
-    body_at: Float64
-    kept: Float64  # rows that had better stay
-    kept_at: Float64
-    hues: _Hues | None
-    least: float  # log density
-    back: float = 1.0  # how much of what had better stay is drawn back to where it was
-    strict: bool = False
-    strictly_hued: bool = False
-    hole: float = math.inf  # the darkest middle of a highlight, in log f
-
-    def relaxed(self) -> list[_Task]:
-        """This task with what it keeps held, drawn back, and left to itself."""
-        if len(self.kept):
-            rows = np.vstack([self.body, self.kept])
-            held = self._replace(
-                body=rows, body_at=np.append(self.body_at, self.kept_at), kept=self.kept[:0]
-            )
-            return [held._replace(strict=True), self._replace(strict=True), self._replace(back=0.0)]
-        return [self._replace(strict=True), self._replace(back=0.0)]
-
-    def towards(self, z: Float64, way: float, last: bool) -> Float64 | None:
-        """From z to where scores have changed by `way` of the rates, exactly in the `last` step;
-        None if that cannot be."""
-        space = self.space
-        wanted = self.start + self.rates * way
-        before, first, near = math.inf, math.inf, None
-        thinned = pitted = False
-        from_here = step = np.zeros(len(z))
-        for turn in range(8 if self.strict else 10):
-            # slopes are kept as long as they lead there
-            if near is None:
-                score, columns, pit, near = self._slopes(z)
-            else:
-                score, columns, pit = space._read(z)
-            missing, rows, stiff, pull, off = self._rows(z, wanted, score, columns, near)
-            miss, thin = float(np.abs(missing).max(initial=0.0)), 0.0
-            if self.least > -math.inf:
-                assert space.density is not None
-                found, uphill = space.density.slope(z)
-                thin = self.least - found
-            hole = pit - self.hole
-            enough = _EXACT if last and turn < (6 if self.strict else 8) else _NEAR
-            fits = thin <= 1e-3 and hole <= 0.03 and off <= _TURN
-            if miss <= enough and fits and turn > 0:
-                return z
-            merit = miss + max(hole, 0.0) + 0.1 * max(thin, 0.0)
-            if turn == 5 and merit > 0.5 * first:
-                return None  # it leads nowhere
-            first = merit if turn == 0 else first
-            if merit > 1.2 * before and turn > 1:  # too far: half of it
-                step, near = 0.5 * step, None
-                z = np.clip(from_here + step, space.low, space.high)
-                continue
-            if merit > 0.3 * before and turn:
-                _, _, _, near = self._slopes(z)
-                missing, rows, stiff, pull, off = self._rows(z, wanted, score, columns, near)
-            before = merit
-            # what a step has run into stays a wall in those that follow
-            thinned, pitted = thinned or thin > 0.0, pitted or hole > 0.0
-            if thinned:
-                missing, rows = np.append(missing, thin), np.vstack([rows, uphill])
-            if pitted:
-                missing, rows = np.append(missing, -hole), np.vstack([rows, near.inward])
-            found_step = _step(stiff, rows, missing, space.low - z, space.high - z, pull)
-            if found_step is None:
-                return None
-            from_here, step = z, found_step
-            z = np.clip(z + step, space.low, space.high)
-        return None
-
-    def _rows(
-        self, z: Float64, wanted: Float64, score: Float64, columns: Float64, near: _Slopes
-    ) -> tuple[Float64, Float64, Float64, Float64, float]:
-        """What is missing of what is fixed and its rows, the stiffness and pull of what had
-        better stay, and how far hues are off."""
-        missing = np.concatenate([wanted - score[self.fixed], self.body_at - self.body @ z])
-        rows = np.concatenate([near.scores[self.fixed], self.body])
-        pull = self.back * _APART * near.scores[self.soft].T @ (self.soft_start - score[self.soft])
-        if len(self.kept):
-            pull = pull + self.back * _BODY * self.kept.T @ (self.kept_at - self.kept @ z)
-        off = 0.0
-        if self.hues is not None:
-            seen = _chroma(columns)
-            pull = pull - _HUE * near.hues.T @ self.hues.turned(*seen)
-            off = self.hues.off(*seen) if self.strictly_hued else 0.0
-        return missing, rows, near.stiff, pull, off
-
-    def _slopes(self, z: Float64) -> tuple[Float64, Float64, float, _Slopes]:
-        """Scores, descriptors and the hole at z, and how they change with it."""
-        score, slopes, columns, hole, inward = self.space._sloped(z)
-        apart = slopes[self.soft]
-        stiff = self.space._stiffness + _APART * apart.T @ apart + _BODY * self.kept.T @ self.kept
-        hues = np.zeros((0, len(z)))
-        if self.hues is not None:
-            turned = self.hues.turned(*_chroma(columns))
-            hues = (turned[1:] - turned[0]).T / _SMALL
-            stiff = stiff + _HUE * hues.T @ hues
-        return score, columns[0], hole, _Slopes(slopes, hues, stiff, inward)
-
-    def _here(self, z: Float64, way: float) -> tuple[Float64, Float64, Float64, Float64, float]:
-        """`_rows` of the way from z."""
-        score, columns, _, near = self._slopes(z)
-        return self._rows(z, self.start + self.rates * way, score, columns, near)
-
-    def possible(self, z: Float64) -> bool:
-        """Whether a small step would be, were there no gamut."""
-        missing, rows, stiff, pull, _ = self._here(z, _STEP)
-        far = np.full(len(z), np.inf)
-        return _step(stiff, rows, missing, -far, far, 0.0 * pull) is not None
-
-    def compromise(self, z: Float64, way: float) -> Float64:
-        """Where all that cannot be had together gives way alike."""
-        space = self.space
-        missing, rows, stiff, _, _ = self._here(z, way)
-        step = np.linalg.solve(1e-2 * stiff + rows.T @ rows, rows.T @ missing)
-        clipped: Float64 = np.clip(z + step, space.low, space.high)
-        return clipped
-
-
-def _step(
-    stiff: Float64,
-    rows: Float64,
-    wanted: Float64,
-    least: Float64,
-    most: Float64,
-    pull: Float64,
-) -> Float64 | None:
-    """The step (k,) that makes step @ stiff @ step / 2 - pull @ step least, with rows @ step =
-    wanted and least <= step <= most; None if there is none."""
-    step = np.zeros(len(stiff))
-    free = np.ones(len(stiff), bool)
-    size = max(float(np.abs(wanted).max(initial=0.0)), 1e-12)
-    for _ in range(len(stiff)):
-        some, stuck = rows[:, free], step[~free]
-        drawn = pull[free] - stiff[np.ix_(free, ~free)] @ stuck
-        both = np.linalg.solve(stiff[np.ix_(free, free)], np.column_stack([some.T, drawn]))
-        spread, drift = both[:, :-1], both[:, -1]
-        rest = wanted - rows[:, ~free] @ stuck - some @ drift
-        part = drift + spread @ np.linalg.lstsq(some @ spread, rest, rcond=1e-10)[0]
-        wrong = np.abs(some @ part + rows[:, ~free] @ stuck - wanted).max(initial=0.0)
-        if wrong > 0.3 * size or np.abs(part).max() > _ABSURD:
-            return None
-        step[free] = part
-        out = free & ((step < least - 1e-12) | (step > most + 1e-12))
-        if not out.any():
-            return step
-        step[out] = np.clip(step[out], least[out], most[out])
-        free &= ~out
-        if not free.any():
-            return None
-    return None
-
-
-_ABSURD = 25.0  # standard deviations of a coordinate: no step is that long
 
 
 def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> Float64:
