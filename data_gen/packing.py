@@ -14,9 +14,10 @@ from scipy.optimize import nnls
 from data_gen.families import materials
 from data_gen.labels import TRAITS, grading, labels
 from data_gen.tables import Progress, Tables
-from traitbrdf.descriptors import READINGS, describe, read, reading_rows
+from traitbrdf.descriptors import PROFILE, READINGS, describe, read, reading_rows
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
 from traitbrdf.moves import Grades, Optics, Readings
+from traitbrdf.profiles import CORE, HIGHLIGHT
 from traitbrdf.traits import TraitSpace
 
 COUNT = 2040
@@ -118,6 +119,14 @@ def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
             found, _ = nnls(relative[:, chosen], np.ones(len(relative)))
             rows[i] = 0.0
             rows[i, used[chosen]] = found
-    kept = np.flatnonzero(rows.any(axis=0))
+    # the cells of the highlight, which decoding mends: all from the middle to its rim
+    grid, last = embedding.grid_, READINGS.index(f"profile {len(PROFILE) - 1}")
+    ends = np.flatnonzero(rows[last])
+    per = grid.n_theta_d * grid.n_phi_d
+    nodes = np.append(np.flatnonzero(grid.theta_h <= HIGHLIGHT), ends[0] // per)
+    columns = nodes[:, None] * per + ends % per
+    kept = np.union1d(np.flatnonzero(rows.any(axis=0)), columns)
     log_rows, mean = embedding.log_rows(kept)
-    return Readings(log_rows, mean, rows[:, kept])
+    share = embedding.trend_share(columns.ravel()).reshape(columns.shape)
+    core = int(np.sum(grid.theta_h <= CORE))
+    return Readings(log_rows, mean, rows[:, kept], np.searchsorted(kept, columns), share, core)

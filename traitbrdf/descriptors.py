@@ -262,16 +262,16 @@ def formulas(readings: Any) -> Any:
         for c in range(3):
             albedo = max(r[_ALBEDO, c], 1e-4)
             body_rgb[c] = max(r[_BODY, c], 0.0)
-            lobe[c] = _above(max(r[_PEAK, c], 0.0), body_rgb[c], 1e-3)
+            lobe[c] = above(max(r[_PEAK, c], 0.0), body_rgb[c], 1e-3)
             peak_lobe = max(peak_lobe, lobe[c])
-            reflected = _above(albedo, math.pi * body_rgb[c], _DARK)
+            reflected = above(albedo, math.pi * body_rgb[c], _DARK)
             colour[c, 0] = math.log(max(albedo - reflected, 0.0) + _DARK)
             colour[c, 1] = math.log(reflected + _DARK)
             albedo_light += LUMINANCE[c] * albedo
         for i in range(len(profile)):
             profile[i] = _light(r[_PEAK + i])
         peak, body = profile[0], _light(r[_BODY])
-        specular = _above(albedo_light, math.pi * body, _DARK)
+        specular = above(albedo_light, math.pi * body, _DARK)
         diffuse = max(albedo_light - specular, 0.0)
         steep = max(_light(r[_STEEP]) - body, 0.0) * _COS_STEEP
         grazing = max(_light(r[_GRAZING]) - body, 0.0) * _COS_GRAZING
@@ -322,18 +322,24 @@ def _light(rgb: Any) -> Any:
 @numba.njit(cache=True, nogil=True)
 def _hue(rgb: Any) -> Any:
     """Hue angle in degrees and chroma of one linear RGB, as `hue` of `cielab`."""
+    a, b = opponents(rgb)
+    return math.degrees(math.atan2(b, a)) % 360.0, math.hypot(a, b)
+
+
+@numba.njit(cache=True, nogil=True)
+def opponents(rgb: Any) -> Any:
+    """a* and b* of one linear RGB, as of `cielab`."""
     f = np.empty(3)
     for i in range(3):
         x = 0.0
         for c in range(3):
             x += _WHITE[i, c] * rgb[c]
         f[i] = np.cbrt(x) if x > (6 / 29) ** 3 else x * (29 / 6) ** 2 / 3 + 4 / 29
-    a, b = 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])
-    return math.degrees(math.atan2(b, a)) % 360.0, math.hypot(a, b)
+    return 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])
 
 
 @numba.njit(cache=True, nogil=True)
-def _above(whole: Any, body: Any, soft: Any) -> Any:
+def above(whole: Any, body: Any, soft: Any) -> Any:
     """What of the whole is above the body, never quite nothing: max(whole - body, 0), but smooth,
     and no more than the whole."""
     over = whole - body

@@ -23,9 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf.descriptors import (
     DESCRIPTORS,
     LUMINANCE,
-    PROFILE,
     READINGS,
+    above,
     formulas,
+    opponents,
 )
 from traitbrdf.embedding import FLOOR
 
@@ -37,7 +38,7 @@ _NEAR = 2e-3  # how near is near enough where a score has a kink
 _APART = 10.0  # what a change of unrelated scores costs, beside the metric
 _BODY = 30.0  # what a change of the body costs, where it is kept
 _HUE = 10.0  # what a unit of a* or b* costs, where colour is held
-_TURN = 1.5  # degrees that hues may turn then
+_TURN = 1.0  # degrees that hues may turn then
 _DEPENDENT = 1e-11  # of slopes: what differs by less is one and the same
 _ABSURD = 25.0  # standard deviations of a coordinate: no step is that long
 _SMALL = 1e-5  # a step along a coordinate that shows slopes
@@ -82,8 +83,12 @@ class Density(NamedTuple):
 
     def log(self, z: Float64) -> float:
         """log density at z (k,), to a constant."""
+        return self.slope(z)[0]
+
+    def slope(self, z: Float64) -> tuple[float, Float64]:
+        """log density at z (k,) and its gradient (k,)."""
         found = _log_density(np.ascontiguousarray(z, np.float64), *self[:3])
-        return float(found[0])
+        return float(found[0]), np.asarray(found[1])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -155,7 +160,6 @@ class Grades(NamedTuple):
         return np.asarray(found).reshape(*descriptors.shape[:-1], len(used))
 
 
-_COUNT = len(DESCRIPTORS)
 _ORDER = {name: i for i, name in enumerate(DESCRIPTORS)}
 
 
@@ -186,11 +190,6 @@ def _interpolated(values: Any, used: Any, at: Any, grade: Any) -> Any:
     return out
 
 
-_FIRST = READINGS.index("profile 0")
-_HIGHLIGHT = sum(theta <= 30.0 for theta in PROFILE)
-"""Readings of the highlight, within which decoding leaves no hole (`traitbrdf.profiles`)."""
-
-
 class Readings(NamedTuple):
     """What `descriptors.READINGS` need of an embedding: few cells.
 
@@ -198,11 +197,18 @@ class Readings(NamedTuple):
     ----------
     rows, mean : (3, cells, k) and (cells,), log(f + FLOOR) of a channel: rows @ z + mean
     weights : (readings, cells)
+    columns : (n, c) int64, the cells from the middle to the rim of the highlight, and the last of
+        the profile, for each theta_d that it has
+    share : (n, c), of the trend of a column what it may have risen (`profiles.Profiles`)
+    core : how many of the n the trend is counted from
     """
 
     rows: Float64
     mean: Float64
     weights: Float64
+    columns: NDArray[np.int64]
+    share: Float64
+    core: int
 
     def at(self, z: Float64) -> Float64:
         """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
@@ -212,19 +218,23 @@ class Readings(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _near(z: Any, rows: Any, mean: Any, weights: Any, sloped: Any) -> Any:
+def _near(
+    z: Any, rows: Any, mean: Any, weights: Any, columns: Any, share: Any, core: Any, sloped: Any
+) -> Any:
     """Readings (readings, 3) at a point and their slopes (readings, 3, k), 0 if they are not
     wanted; by how much (log f) the middle of the highlight is darker there than what is around it,
     before decoding mends it, and its slope (k,)."""
     count, cells = weights.shape
     value, slopes = np.zeros((count, 3)), np.zeros((count, 3, len(z)))
-    raised = np.empty((3, cells))
+    log, raised = np.empty((3, cells)), np.empty((3, cells))
     for c in range(3):
         for n in range(cells):
-            log = mean[n]
+            log[c, n] = mean[n]
             for k in range(len(z)):
-                log += rows[c, n, k] * z[k]
-            raised[c, n] = math.exp(min(log, 30.0))
+                log[c, n] += rows[c, n, k] * z[k]
+            raised[c, n] = math.exp(min(log[c, n], 30.0))
+    hole, inward = _hole(columns, raised, rows, sloped)
+    source, extra, first, last = _mend(columns, share, core, log, raised)
     for i in range(count):
         for n in range(cells):
             weight = weights[i, n]
@@ -232,106 +242,146 @@ def _near(z: Any, rows: Any, mean: Any, weights: Any, sloped: Any) -> Any:
                 for c in range(3):
                     value[i, c] += weight * max(raised[c, n] - FLOOR, 0.0)
                     if sloped:
+                        by, s = weight * raised[c, n], source[c, n]
                         for k in range(len(z)):
-                            slopes[i, c, k] += weight * raised[c, n] * rows[c, n, k]
-    top, most = _FIRST, -1.0
-    for i in range(_FIRST, count):
-        light = 0.0
-        for c in range(3):
-            light += LUMINANCE[c] * value[i, c]
-        if light > most:
-            top, most = i, light
-    middle = 0.0
-    for c in range(3):
-        middle += LUMINANCE[c] * value[_FIRST, c]
-    hole = math.log((most + FLOOR) / (middle + FLOOR))
-    inward = np.zeros(len(z))
-    for c in range(3):
-        for k in range(len(z)):
-            inward[k] += LUMINANCE[c] * slopes[top, c, k] / (most + FLOOR)
-            inward[k] -= LUMINANCE[c] * slopes[_FIRST, c, k] / (middle + FLOOR)
-    # no hole in the highlight: as high as what follows, of which it then has the slope too
-    for i in range(_FIRST + _HIGHLIGHT - 2, _FIRST - 1, -1):
-        for c in range(3):
-            if value[i, c] < value[i + 1, c]:
-                value[i, c] = value[i + 1, c]
-                for k in range(len(z)):
-                    slopes[i, c, k] = slopes[i + 1, c, k]
+                            slopes[i, c, k] += by * rows[c, s, k]
+                        if extra[c, n] != 0.0:
+                            to, since = last[c, n], first[c, n]
+                            for k in range(len(z)):
+                                rise = rows[c, to, k] - rows[c, since, k]
+                                slopes[i, c, k] += by * extra[c, n] * rise
     brightest = 0
     for c in range(3):
         if value[0, c] > value[0, brightest]:
             brightest = c
     whole = value[0, brightest]
     if whole > 1.0:  # no more light than there was
-        by = np.empty(len(z))
+        fall = np.empty(len(z))
         for k in range(len(z)):
-            by[k] = slopes[0, brightest, k] / whole
+            fall[k] = slopes[0, brightest, k] / whole
         for i in range(count):
             for c in range(3):
                 for k in range(len(z)):
-                    slopes[i, c, k] = (slopes[i, c, k] - value[i, c] * by[k]) / whole
+                    slopes[i, c, k] = (slopes[i, c, k] - value[i, c] * fall[k]) / whole
                 value[i, c] /= whole
     return value, slopes, hole, inward
 
 
+@numba.njit(cache=True, nogil=True)
+def _hole(columns: Any, raised: Any, rows: Any, sloped: Any) -> Any:
+    """By how much (log f) the middle of the profile is darker than its brightest, and the slope
+    (k,)."""
+    light = np.zeros(len(columns))
+    top = 0
+    for i in range(len(columns)):
+        for n in columns[i]:
+            for c in range(3):
+                light[i] += LUMINANCE[c] * raised[c, n]
+        if light[i] > light[top]:
+            top = i
+    inward = np.zeros(rows.shape[2])
+    if sloped:
+        for i, sign in ((top, 1.0), (0, -1.0)):
+            for n in columns[i]:
+                for c in range(3):
+                    by = sign * LUMINANCE[c] * raised[c, n] / light[i]
+                    for k in range(len(inward)):
+                        inward[k] += by * rows[c, n, k]
+    return math.log(light[top] / light[0]), inward
+
+
+@numba.njit(cache=True, nogil=True)
+def _mend(columns: Any, share: Any, core: Any, log: Any, raised: Any) -> Any:
+    """Fills the valleys of columns, as `profiles.Profiles` does with all their nodes: changes
+    `raised` (3, cells); the cell of which each has its value, how much of a trend comes on top, and
+    between which cells that is."""
+    shape = log.shape
+    source, extra = np.empty(shape, np.int64), np.zeros(shape)
+    first, last = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    for c in range(shape[0]):
+        for n in range(shape[1]):
+            source[c, n] = n
+        for j in range(columns.shape[1]):
+            end, top = columns[len(columns) - 1, j], columns[0, j]
+            for i in range(1, core):
+                if log[c, columns[i, j]] > log[c, top]:
+                    top = columns[i, j]
+            trend = max(log[c, end] - log[c, top], 0.0)
+            best, at = -math.inf, 0
+            for i in range(len(columns) - 2, -1, -1):
+                n = columns[i, j]
+                even = log[c, n] - share[i, j] * trend
+                if even > best:
+                    best, at = even, i
+                else:
+                    source[c, n], first[c, n], last[c, n] = columns[at, j], top, end
+                    extra[c, n] = share[i, j] - share[at, j] if trend > 0.0 else 0.0
+                    raised[c, n] = math.exp(min(best + share[i, j] * trend, 30.0))
+    return source, extra, first, last
+
+
 PALE = 5.0  # C*ab: paler colours have no hue to speak of
-_DARK = 0.006  # albedo of a body or lobe that has none either
+_DARK = 0.003  # f of a body or lobe that has half a hue
+
+_BODY_AT, _PEAK_AT = READINGS.index("body"), READINGS.index("profile 0")
 
 
-_HUES = np.array([_ORDER["diffuse_hue"], _ORDER["specular_hue"]])
-_CHROMAS = np.array([_ORDER["diffuse_chroma"], _ORDER["specular_chroma"]])
-_DIFFUSE, _CONTRAST = _ORDER["diffuse"], _ORDER["highlight"]
-
-
-def chromas(columns: Float64) -> Float64:
-    """a* and b* (2, 2) of body and lobe, of descriptors (1, n)."""
-    return np.asarray(_colours(columns)[0][0])
+def colours(readings: Float64) -> Float64:
+    """a* and b* (2, 2) of body and lobe, of readings (1, readings, 3); what is not seen is grey."""
+    found, seen = _colours(readings)
+    return np.asarray(found[0] * np.minimum(2.0 * seen[0], 1.0)[:, None])
 
 
 @numba.njit(cache=True, nogil=True)
-def _colours(columns: Any) -> Any:
-    """a* and b* (m, 2, 2) of body and lobe, of descriptors (m, n), and how much there is of both
-    (m, 2): 0 nothing to see a hue of, 1 enough."""
-    colours, sure = np.empty((len(columns), 2, 2)), np.empty((len(columns), 2))
-    for m in range(len(columns)):
-        row = columns[m]
-        # contrast: difference of the cube roots of radiance factors, of which the body's is diffuse
-        body = row[_DIFFUSE]
-        lobe = (row[_CONTRAST] + np.cbrt(body)) ** 3 - body
-        sure[m, 0] = min(max(body / _DARK - 1.0, 0.0), 1.0)
-        sure[m, 1] = min(max(lobe / (_DARK + 0.5 * body) - 1.0, 0.0), 1.0)
+def _colours(readings: Any) -> Any:
+    """a* and b* (m, 2, 2) of body and lobe, this scaled to white, of readings (m, readings, 3), and
+    how much there is of both (m, 2): 0 nothing to see a hue of, 1 enough."""
+    found, seen = np.empty((len(readings), 2, 2)), np.empty((len(readings), 2))
+    rgb, light = np.empty((2, 3)), np.empty(2)
+    for m in range(len(readings)):
+        for c in range(3):
+            rgb[0, c] = max(readings[m, _BODY_AT, c], 0.0) + 1e-6
+            rgb[1, c] = above(max(readings[m, _PEAK_AT, c], 0.0), rgb[0, c], 1e-3) + 1e-6
         for i in range(2):
-            angle, chroma = math.radians(row[_HUES[i]]), row[_CHROMAS[i]]
-            colours[m, i, 0], colours[m, i, 1] = chroma * math.cos(angle), chroma * math.sin(angle)
-    return colours, sure
+            light[i] = 0.0
+            for c in range(3):
+                light[i] += LUMINANCE[c] * rgb[i, c]
+            whole = max(rgb[1, 0], rgb[1, 1], rgb[1, 2]) if i else 1.0 / math.pi
+            for c in range(3):
+                rgb[i, c] /= whole
+            found[m, i] = opponents(rgb[i])
+        seen[m, 0] = light[0] / (light[0] + _DARK)
+        # never quite nothing, so that slopes tell what colour a lobe will have once it is seen
+        seen[m, 1] = light[1] / (light[1] + _DARK + 0.5 * light[0])
+    return found, seen
 
 
 @numba.njit(cache=True, nogil=True)
-def _turned(kept: Any, colours: Any, sure: Any) -> Any:
+def _turned(kept: Any, found: Any, seen: Any) -> Any:
     """Of `_colours` (2, 2) what shall stay 0 (4,): a* and b* across the kept hues (2, 2), and along
     them for what is pale."""
     out = np.empty(4)
     for i in range(2):
         chroma = math.hypot(kept[i, 0], kept[i, 1])
-        along = kept[i] / max(chroma, 1e-9)
-        beside = colours[i, 1] * along[0] - colours[i, 0] * along[1]
-        ahead = colours[i, 0] * along[0] + colours[i, 1] * along[1] - chroma
+        x, y = (kept[i, 0] / chroma, kept[i, 1] / chroma) if chroma > 0.0 else (1.0, 0.0)
+        ahead = found[i, 0] * x + found[i, 1] * y - chroma
         pale = min(max(1.0 - chroma / (2.0 * PALE), 0.0), 1.0)
         # a colour that fades stops short of turning into its opposite
         faded = min(ahead + 0.6 * chroma, 0.0)
-        out[i], out[2 + i] = sure[i] * beside, sure[i] * (pale * ahead + faded)
+        out[i] = seen[i] * (found[i, 1] * x - found[i, 0] * y)
+        out[2 + i] = seen[i] * (pale * ahead + faded)
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _off(kept: Any, colours: Any, sure: Any) -> Any:
+def _off(kept: Any, found: Any, seen: Any) -> Any:
     """By how many degrees hues of `_colours` (2, 2) are off, as far as there are hues."""
     worst = 0.0
     for i in range(2):
-        now, then = complex(colours[i, 0], colours[i, 1]), complex(kept[i, 0], kept[i, 1])
-        seen = min(min(abs(now), abs(then)) / PALE, 1.0)
+        now, then = complex(found[i, 0], found[i, 1]), complex(kept[i, 0], kept[i, 1])
+        sure = min(min(abs(now), abs(then)) / PALE, 1.0) * min(2.0 * seen[i], 1.0)
         turn = then * now.conjugate()
-        worst = max(worst, abs(math.degrees(math.atan2(turn.imag, turn.real))) * seen * sure[i])
+        worst = max(worst, sure * abs(math.degrees(math.atan2(turn.imag, turn.real))))
     return worst
 
 
@@ -348,7 +398,7 @@ class Ground(NamedTuple):
     Parameters
     ----------
     read : whether scores are read off descriptors; if not, readings and grades are not looked at
-    rows, mean, cells : as `Readings`
+    core, rows, mean, cells, columns, share : as `Readings`
     used : (d,) places of the graded descriptors among all
     at, grade : as `Grades`
     weights, normals : (t, d) and (t, k), raw scores: weights @ grades + normals @ z
@@ -359,9 +409,12 @@ class Ground(NamedTuple):
     """
 
     read: bool
+    core: int
     rows: Float64
     mean: Float64
     cells: Float64
+    columns: NDArray[np.int64]
+    share: Float64
     used: NDArray[np.int64]
     at: Float64
     grade: Float64
@@ -392,38 +445,46 @@ class Ground(NamedTuple):
         k = len(low)
         none = np.zeros((0, 0))
         readings, grades = optics or (
-            Readings(np.zeros((3, 0, k)), np.zeros(0), none),
+            Readings(np.zeros((3, 0, k)), np.zeros(0), none, np.zeros((0, 0), np.int64), none, 0),
             Grades((), none, none),
         )
         where = density or Density(np.zeros((0, k)), np.zeros((0, k, k)), np.zeros(0), np.zeros(0))
         some = [
-            readings.rows, readings.mean, readings.weights, _places(grades.names), grades.at,
+            *readings[:-1], _places(grades.names), grades.at,
             grades.grade, weights, normals, zero, span, stiffness, low, high, where.means,
             where.whiten, where.logs,
         ]  # fmt: skip
         # of one layout: each other one would be compiled anew
-        return cls(optics is not None, *(np.array(array, order="C") for array in some))
+        found: list[Any] = [np.array(array, order="C") for array in some]
+        return cls(optics is not None, int(readings.core), *found)
 
     def look(self, z: Float64) -> tuple[Float64, Float64, float]:
-        """Scores (t,) at z (k,), descriptors (1, n) and how dark the middle of the highlight is;
-        zeros where none are read."""
+        """Scores (t,) at z (k,), readings (1, readings, 3) and how dark the middle of the highlight
+        is; zeros where none are read."""
         found = _look(self, np.ascontiguousarray(z, np.float64))
         return found[0], found[1], float(found[2])
 
 
 @numba.njit(cache=True, nogil=True)
+def _read(ground: Any, z: Any, sloped: Any) -> Any:
+    return _near(
+        z, ground.rows, ground.mean, ground.cells, ground.columns, ground.share, ground.core, sloped
+    )
+
+
+@numba.njit(cache=True, nogil=True)
 def _look(ground: Any, z: Any) -> Any:
-    score, columns, hole = _dots(ground.normals, z), np.zeros((1, _COUNT)), 0.0
+    score, readings, hole = _dots(ground.normals, z), np.zeros((1, len(READINGS), 3)), 0.0
     if ground.read:
-        near = _near(z, ground.rows, ground.mean, ground.cells, False)
-        columns, hole = formulas(np.expand_dims(near[0], 0)), near[2]
-        grades = _interpolated(columns, ground.used, ground.at, ground.grade)
+        near = _read(ground, z, False)
+        readings, hole = np.expand_dims(near[0], 0), near[2]
+        grades = _interpolated(formulas(readings), ground.used, ground.at, ground.grade)
         for i in range(len(score)):
             for j in range(grades.shape[1]):
                 score[i] += ground.weights[i, j] * grades[0, j]
     for i in range(len(score)):
         score[i] = (score[i] - ground.zero[i]) / ground.span[i]
-    return score, columns, hole
+    return score, readings, hole
 
 
 @numba.njit(cache=True, nogil=True)
@@ -514,10 +575,10 @@ def compromise(ground: Ground, task: Task, z: Float64, way: float) -> Float64:
 
 def _linear(ground: Ground, task: Task, z: Float64, way: float) -> tuple[Float64, Float64, Float64]:
     """What is missing (m,) of the way from z, rows (m, k), and the stiffness (k, k)."""
-    score, columns, _ = ground.look(z)
-    missing = _missing(task, z, way, score, columns)[0]
+    score, readings, _ = ground.look(z)
+    missing = _missing(task, z, way, score, readings)[0]
     slopes, hues, stiff, _ = _around(ground, task, z)
-    rows, _ = _rows(task, z, score, columns, slopes, hues)
+    rows, _ = _rows(task, z, score, readings, slopes, hues)
     return missing[:-2], rows[:-2], stiff
 
 
@@ -550,8 +611,8 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
     from_here, step, uphill = z.copy(), np.zeros(len(z)), np.zeros(len(z))
     slopes, hues, stiff, inward = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), uphill
     for turn in range(8 if task.strict else 10):
-        score, columns, pit = _look(ground, z)
-        missing, miss, off = _missing(task, z, way, score, columns)
+        score, readings, pit = _look(ground, z)
+        missing, miss, off = _missing(task, z, way, score, readings)
         thin = 0.0
         if task.least > -math.inf:
             found, uphill = _log_density(z, ground.means, ground.whiten, ground.logs)
@@ -574,7 +635,7 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
                 slopes, hues, stiff, inward = _around(ground, task, z)
                 sloped = True
             before = merit
-            rows, pull = _rows(task, z, score, columns, slopes, hues)
+            rows, pull = _rows(task, z, score, readings, slopes, hues)
             count = len(task.fixed) + len(task.body)
             # what a step has run into stays a wall in those that follow
             thinned, pitted = thinned or thin > 0.0, pitted or hole > 0.0
@@ -602,18 +663,16 @@ def _around(ground: Any, task: Any, z: Any) -> Any:
     better stay, and the gradient of the hole (k,)."""
     k, t = len(z), len(ground.normals)
     slopes = ground.normals.copy()
-    columns, inward = np.zeros((k + 1, _COUNT)), np.zeros(k)
+    steps, inward = np.zeros((k + 1, len(READINGS), 3)), np.zeros(k)
     if ground.read:
-        readings, by_z, _, inward = _near(z, ground.rows, ground.mean, ground.cells, True)
-        steps = np.empty((k + 1, len(readings), 3))
+        readings, by_z, _, inward = _read(ground, z, True)
         for i in range(len(readings)):
             for c in range(3):
                 # formulas of a few numbers: cheaper once more than their slopes
                 steps[0, i, c] = readings[i, c]
                 for n in range(k):
                     steps[n + 1, i, c] = readings[i, c] + _SMALL * by_z[i, c, n]
-        columns = formulas(steps)
-        grades = _interpolated(columns, ground.used, ground.at, ground.grade)
+        grades = _interpolated(formulas(steps), ground.used, ground.at, ground.grade)
         for i in range(t):
             for n in range(k):
                 for j in range(grades.shape[1]):
@@ -624,10 +683,10 @@ def _around(ground: Any, task: Any, z: Any) -> Any:
             slopes[i, n] /= ground.span[i]
     hues = np.zeros((4, k))
     if task.hued:
-        colours, sure = _colours(columns)
-        here = _turned(task.hues, colours[0], sure[0])
+        found, seen = _colours(steps)
+        here = _turned(task.hues, found[0], seen[0])
         for n in range(k):
-            there = _turned(task.hues, colours[n + 1], sure[n + 1])
+            there = _turned(task.hues, found[n + 1], seen[n + 1])
             for i in range(4):
                 hues[i, n] = (there[i] - here[i]) / _SMALL
     stiff = ground.stiffness.copy()
@@ -649,7 +708,7 @@ def _stiffen(stiff: Any, row: Any, by: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _missing(task: Any, z: Any, way: Any, score: Any, columns: Any) -> Any:
+def _missing(task: Any, z: Any, way: Any, score: Any, readings: Any) -> Any:
     """What is missing (m + 2,) of what is fixed, the most of it, and by how many degrees hues are
     off; the last two are left for walls."""
     count, most, off = len(task.fixed), 0.0, 0.0
@@ -662,13 +721,13 @@ def _missing(task: Any, z: Any, way: Any, score: Any, columns: Any) -> Any:
     for value in missing:
         most = max(most, abs(value))
     if task.hued and task.strictly_hued:
-        colours, sure = _colours(columns)
-        off = _off(task.hues, colours[0], sure[0])
+        found, seen = _colours(readings)
+        off = _off(task.hues, found[0], seen[0])
     return missing, most, off
 
 
 @numba.njit(cache=True, nogil=True)
-def _rows(task: Any, z: Any, score: Any, columns: Any, slopes: Any, hues: Any) -> Any:
+def _rows(task: Any, z: Any, score: Any, readings: Any, slopes: Any, hues: Any) -> Any:
     """The rows (m + 2, k) of what is fixed, and the pull (k,) of what had better stay."""
     count, k = len(task.fixed), len(z)
     rows, pull = np.zeros((count + len(task.body) + 2, k)), np.zeros(k)
@@ -683,8 +742,8 @@ def _rows(task: Any, z: Any, score: Any, columns: Any, slopes: Any, hues: Any) -
     for i in range(len(kept)):
         _add(pull, task.kept[i], task.back * _BODY * (task.kept_at[i] - kept[i]))
     if task.hued:
-        colours, sure = _colours(columns)
-        turned = _turned(task.hues, colours[0], sure[0])
+        found, seen = _colours(readings)
+        turned = _turned(task.hues, found[0], seen[0])
         for i in range(len(turned)):
             _add(pull, hues[i], -_HUE * turned[i])
     return rows, pull

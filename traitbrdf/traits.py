@@ -36,7 +36,7 @@ from traitbrdf.moves import (
     Optics,
     Readings,
     Task,
-    chromas,
+    colours,
     compromise,
     follow,
     possible,
@@ -524,12 +524,12 @@ class TraitSpace:
             least = min(limit, self.density.log(inside))
         coloured = any(self.names[i] in COLOURFUL for i in moved)
         strictly = "colour" in hold or "color" in hold
-        score, columns, pit = self._ground.look(inside)
+        score, readings, pit = self._ground.look(inside)
         hole = max(_HOLE, pit) if photoreal and self.optics is not None else math.inf
         hued = self.optics is not None and (strictly or not coloured)
         return Task(
             fixed, rates, score[fixed], soft, score[soft], body, body @ inside, kept,
-            kept @ inside, hued, chromas(columns), strictly, least, hole,
+            kept @ inside, hued, colours(readings), strictly, least, hole,
         )  # fmt: skip
 
     def _said(
@@ -608,7 +608,9 @@ class TraitSpace:
             ),
         }
         if self.optics is not None:
-            state |= {f"reading_{k}": v for k, v in self.optics.readings._asdict().items()}
+            state |= {
+                f"reading_{k}": np.array(v) for k, v in self.optics.readings._asdict().items()
+            }
             state |= {f"grade_{k}": np.array(v) for k, v in self.optics.grades._asdict().items()}
         if self.density is not None:
             state |= {f"density_{k}": v for k, v in self.density._asdict().items()}
@@ -618,14 +620,16 @@ class TraitSpace:
     def from_arrays(cls, state: Mapping[str, NDArray[Any]]) -> TraitSpace:
         """The inverse of `arrays`, with the box `low`, `high` of the embedding's arrays."""
 
-        def group(kind: str, names: Iterable[str]) -> list[Float64]:
-            return [np.asarray(state[f"{kind}_{name}"], np.float64) for name in names]
+        def group(kind: str, names: Iterable[str]) -> list[Any]:
+            some = [np.asarray(state[f"{kind}_{name}"]) for name in names]
+            return [v.astype(np.int64 if v.dtype.kind == "i" else np.float64) for v in some]
 
         optics = density = None
         if "reading_rows" in state:
+            cells = [name for name in Readings._fields if name != "core"]
             grade_names = tuple(str(name) for name in state["grade_names"])
             optics = Optics(
-                Readings(*group("reading", Readings._fields)),
+                Readings(*(*group("reading", cells), int(state["reading_core"]))),
                 Grades(grade_names, *group("grade", ("at", "grade"))),
             )
         if "density_means" in state:
