@@ -33,6 +33,9 @@ from traitbrdf.embedding import FLOOR
 Float64 = NDArray[np.float64]
 
 STRIDE = 0.5  # in scores: how far a move goes before it looks again
+_NUDGES = (0.15, 0.4, 0.7)  # shares of the way to a kind of material
+_TRIED = 4  # kinds of material
+_TURNS = 14  # of Newton's method in a stride
 _EXACT = 1e-5  # how near a score is brought
 _NEAR = 2e-3  # how near is near enough where a score has a kink
 _APART = 10.0  # what a change of unrelated scores costs, beside the metric
@@ -406,6 +409,7 @@ class Ground(NamedTuple):
     stiffness : (k, k) metric of moves
     low, high : (k,)
     means, whiten, logs : as `Density`; without one, there are none
+    kinds : (c, t) scores at the means of the c families
     """
 
     read: bool
@@ -428,6 +432,7 @@ class Ground(NamedTuple):
     means: Float64
     whiten: Float64
     logs: Float64
+    kinds: Float64
 
     @classmethod
     def of(
@@ -452,11 +457,15 @@ class Ground(NamedTuple):
         some = [
             *readings[:-1], _places(grades.names), grades.at,
             grades.grade, weights, normals, zero, span, stiffness, low, high, where.means,
-            where.whiten, where.logs,
+            where.whiten, where.logs, np.zeros((0, len(span))),
         ]  # fmt: skip
         # of one layout: each other one would be compiled anew
         found: list[Any] = [np.array(array, order="C") for array in some]
-        return cls(optics is not None, int(readings.core), *found)
+        ground = cls(optics is not None, int(readings.core), *found)
+        families = [np.clip(mean, low, high) for mean in where.means[:-1]]
+        if not families:
+            return ground
+        return ground._replace(kinds=np.array([ground.look(z)[0] for z in families]))
 
     def look(self, z: Float64) -> tuple[Float64, Float64, float]:
         """Scores (t,) at z (k,), readings (1, readings, 3) and how dark the middle of the highlight
@@ -535,27 +544,54 @@ class Task(NamedTuple):
 
     def relaxed(self) -> list[Task]:
         """This task with what it keeps held, drawn back, and left to itself."""
-        free = self._replace(back=0.0, strict=False)
+        free = [self._replace(back=0.0, strict=False)]
+        if self.hued and not self.strictly_hued:
+            free.append(free[0]._replace(hued=False))
         if not len(self.kept):
-            return [self, free]
+            return [self, *free]
         held = self._replace(
             body=np.vstack([self.body, self.kept]),
             body_at=np.append(self.body_at, self.kept_at),
             kept=self.kept[:0],
             kept_at=self.kept_at[:0],
         )
-        return [held, self, free]
+        return [held, self, *free]
 
 
 def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64, float]:
     """Along a move from z (k,) as far as `end` of its rates; where it came to, and how far.
 
-    First all that had better stay does; where that ends, less and less of it.
+    First all that had better stay does; where that ends, less and less of it. Where no path leads
+    on at all (slopes are none where there is no lobe yet), it starts anew a little nearer to kinds
+    of material that have more of what is asked.
     """
     at, way = np.clip(z, ground.low, ground.high), 0.0
-    for more in task.relaxed():
+    relaxed = task.relaxed()
+    for more in relaxed:
         at, way = _path(ground, more, at, way, end)
+    for share in _NUDGES:
+        if way >= end:
+            break
+        for kind in _kinds(ground, task, at):
+            goal = min(way + 0.5 * STRIDE, end)
+            nearer = np.clip(at + share * (kind - at), ground.low, ground.high)
+            fits, found = _towards(ground, relaxed[-1], nearer, goal, goal == end)
+            if fits:
+                at, way = _path(ground, relaxed[-1], found, goal, end)
+                break
     return at, float(way)
+
+
+def _kinds(ground: Ground, task: Task, z: Float64) -> Float64:
+    """The kinds of material (n, k) with the most of what is asked for the least way from z."""
+    moved = task.rates != 0.0
+    have = ground.kinds[:, task.fixed[moved]] - ground.look(z)[0][task.fixed[moved]]
+    away = ground.means[: len(have)] - z
+    far = np.sqrt(np.einsum("nk,kl,nl->n", away, ground.stiffness, away))
+    gain = have @ task.rates[moved] / np.maximum(far, 1e-9)
+    best = np.argsort(-gain, kind="stable")[:_TRIED]
+    nearest: Float64 = ground.means[best[gain[best] > 0.0]]
+    return nearest
 
 
 def possible(ground: Ground, task: Task, z: Float64) -> bool:
@@ -610,7 +646,7 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
     sloped = thinned = pitted = False
     from_here, step, uphill = z.copy(), np.zeros(len(z)), np.zeros(len(z))
     slopes, hues, stiff, inward = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), uphill
-    for turn in range(8 if task.strict else 10):
+    for turn in range(_TURNS):
         score, readings, pit = _look(ground, z)
         missing, miss, off = _missing(task, z, way, score, readings)
         thin = 0.0
@@ -618,7 +654,7 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
             found, uphill = _log_density(z, ground.means, ground.whiten, ground.logs)
             thin = task.least - found
         hole = pit - task.hole
-        enough = _EXACT if last and turn < (6 if task.strict else 8) else _NEAR
+        enough = _EXACT if last and turn < _TURNS - 3 else _NEAR
         if miss <= enough and thin <= 1e-3 and hole <= 0.03 and off <= _TURN and turn > 0:
             return True, z
         merit = miss + max(hole, 0.0) + 0.1 * max(thin, 0.0)
@@ -636,6 +672,8 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
                 sloped = True
             before = merit
             rows, pull = _rows(task, z, score, readings, slopes, hues)
+            if miss <= _NEAR and turn > 3:  # all that is left is to be exact
+                pull[:] = 0.0
             count = len(task.fixed) + len(task.body)
             # what a step has run into stays a wall in those that follow
             thinned, pitted = thinned or thin > 0.0, pitted or hole > 0.0
