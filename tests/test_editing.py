@@ -171,11 +171,11 @@ def test_an_edited_table_keeps_what_it_has_beyond_the_manifold(edit):
     table = tb.TabulatedBRDF.from_model(GGX(0.2, 1.5, 0.0), EMBEDDING.grid_)
     edit.assign("body", table)
     offset = edit.material("body").offset
-    edit.move("body", bright=0.05)
+    edit.move("body", shiny=0.05)
     assert edit.material("body").offset is offset
     moved, z = edit.brdf("body").values, edit.material("body").z
     same(moved, EMBEDDING.decode_values(z, offset).reshape(table.values.shape))
-    edit.move("body", bright=-0.05)
+    edit.move("body", shiny=-0.05)
     again = edit.brdf("body").values
     assert np.median(np.abs(again - table.values) / (table.values + 1e-3)) < 0.02
 

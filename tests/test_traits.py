@@ -52,7 +52,7 @@ def test_a_move_changes_its_score_by_the_amount_and_no_held_one(z, name, amount,
     assert np.all((found.z >= LOW) & (found.z <= HIGH))
     change = dict(zip(SPACE.names, scores(found.z) - scores(z), strict=True))
     if found.complete:
-        assert change[name] == pytest.approx(amount, abs=3e-3)
+        assert change[name] == pytest.approx(amount, abs=2.5e-3)
     if "held" in found.stopped:  # what is held and what is moved depend on each other
         with pytest.raises(ValueError, match="depend on each other"):
             SPACE.move(z, {name: amount}, hold)
@@ -62,7 +62,7 @@ def test_a_move_changes_its_score_by_the_amount_and_no_held_one(z, name, amount,
     assert found.reached[name] == pytest.approx(change[name], abs=1e-9)
     for group in hold:
         for member in GROUPS.get(group, (group,)):
-            assert abs(change[member]) < 5e-3
+            assert abs(change[member]) < 2.5e-3
             assert found.held[member] == pytest.approx(change[member], abs=1e-9)
     np.testing.assert_array_equal(SPACE.move(z, {name: amount}, hold), found.z)
 
@@ -89,7 +89,7 @@ def test_several_traits_move_at_once(z, three):
     change = {name: SPACE.score(found.z)[name] - SPACE.score(z)[name] for name in asked}
     if found.complete:
         for name, amount in asked.items():
-            assert change[name] == pytest.approx(amount, abs=3e-3)
+            assert change[name] == pytest.approx(amount, abs=2.5e-3)
 
 
 @laws
@@ -110,7 +110,7 @@ def test_small_moves_can_be_taken_back(name, amount, i):
     back = SPACE.reach(there.z, {name: -amount})
     if there.complete and back.complete:
         np.testing.assert_allclose(
-            SPACE.score(back.z)[name], SPACE.score(INNER[i])[name], atol=6e-3
+            SPACE.score(back.z)[name], SPACE.score(INNER[i])[name], atol=4.5e-3
         )
 
 
@@ -121,7 +121,7 @@ def test_a_move_in_two_steps_scores_as_in_one(z, name, amount):
     first = SPACE.reach(z, {name: 0.5 * amount})
     second = SPACE.reach(first.z, {name: 0.5 * amount})
     if whole.complete and first.complete and second.complete:
-        assert SPACE.score(second.z)[name] == pytest.approx(SPACE.score(whole.z)[name], abs=6e-3)
+        assert SPACE.score(second.z)[name] == pytest.approx(SPACE.score(whole.z)[name], abs=4.5e-3)
 
 
 @pytest.mark.parametrize("amount", [1e-300, 1e-9, 1e3, 1e9, 1e300, -1e300])
@@ -144,7 +144,7 @@ def test_half_a_unit_is_reached_from_nearly_everywhere(name):
     every = SPACE.scores(LIBRARY.coordinates)[:, SPACE.index(name)]
     can = np.flatnonzero(every + 0.5 <= SPACE.limits[SPACE.index(name), 1])
     found = [SPACE.reach(LIBRARY.coordinates[i], {name: 0.5}) for i in can[::40]]
-    assert np.mean([one.reached[name] >= 0.45 for one in found]) >= 0.8
+    assert np.mean([one.reached[name] >= 0.45 for one in found]) >= 0.9
     assert all(one.complete or one.stopped for one in found)
 
 
@@ -342,7 +342,7 @@ def test_hues_stay_where_colour_is_held():
         found = SPACE.reach(z, {"strength": amount}, ("colour",))
         turned += hue_change(GRID, EMBEDDING.decode_values(z), EMBEDDING.decode_values(found.z))
     assert len(turned) > 10
-    assert np.mean(np.array(turned) <= 2.0) >= 0.9
+    assert max(turned) <= 2.0
 
 
 def test_moves_stay_where_materials_are_unless_told():
@@ -436,7 +436,7 @@ def test_a_trait_is_learnt_from_a_handful_of_labels():
     low, high = np.percentile(found, [10.0, 90.0])
     assert (low, high) == pytest.approx((0.0, 1.0), abs=1e-6)
     z = LIBRARY.coordinates[LIBRARY.index("red-rubber")]
-    assert space.reach(z, {"tinny": 0.3}).reached["tinny"] == pytest.approx(0.3, abs=3e-3)
+    assert space.reach(z, {"tinny": 0.3}).reached["tinny"] == pytest.approx(0.3, abs=2.5e-3)
     again = TraitSpace.from_arrays({**space.arrays(), "low": LOW, "high": HIGH})
     assert again.score(z) == space.score(z)
     replaced = space.with_trait(Trait.from_labels("tinny", names, -labels))
@@ -485,6 +485,11 @@ def test_bad_labels_of_a_trait(materials, labels, match):
 def test_bad_ratings(ratings, match):
     with pytest.raises(ValueError, match=match):
         Trait.from_ratings("x", ["chrome", "red-rubber"], ratings)
+
+
+def test_a_trait_is_moved_once():
+    with pytest.raises(ValueError, match="'glossy' twice"):
+        SPACE.move(INNER[0], {"glossy": 0.3, "glossiness": 0.2})
 
 
 def test_everyday_names_cannot_be_taken():

@@ -37,7 +37,7 @@ from traitbrdf.brdf import (
     TabulatedBRDF,
     albedo_operator,
 )
-from traitbrdf.descriptors import LUMINANCE, cielab, hue
+from traitbrdf.descriptors import LUMINANCE, READINGS, cielab, hue, reading_rows
 from traitbrdf.directions import from_half_diff_angles, to_local
 from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession, trusted_error
 from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
@@ -1042,55 +1042,71 @@ def _composites(count: int) -> Iterator[Record]:
     embedding = library.embedding
     grid = embedding.grid_
     rows = albedo_operator(grid, ALBEDO_ANGLES)
-    least, albedo, hole, turned = math.inf, 0.0, 0.0, []
+    least, albedo, hole = math.inf, 0.0, 0.0
+    turned: list[float] = []
+    wider: list[float] = []
     colourful = {"red", "green", "blue"}
     for _ in range(count):
         z = library.coordinates[rng.integers(len(library))]
         pair = rng.choice(space.names, 2, replace=False)
         amounts = dict(zip(pair.tolist(), rng.uniform(-3.0, 3.0, 2).tolist(), strict=True))
         held = not colourful & set(amounts)
-        moved = space.reach(z, amounts, ("colour",) if held else ()).z
-        before, after = (embedding.decode_values(point) for point in (embedding.clip(z), moved))
+        found = space.reach(z, amounts, ("colour",) if held else ())
+        before, after = (embedding.decode_values(point) for point in (embedding.clip(z), found.z))
         least = min(least, float(after.min()))
         albedo = max(albedo, float((rows @ after).max()))
         hole = max(hole, highlight_hole(grid, after))
-        if held:
+        if held and not found.stopped.startswith("held"):  # such a move is refused
             turned += hue_change(grid, before, after)
+            wider += hue_change(grid, before, after, whole=True)
     how = f"{count} random edits of two traits by up to 3, {grid.size} cells each"
     yield Record.at_least("composite edits, least f", least, "1/sr", 0.0, how=how)
     yield Record.at_most("composite edits, greatest albedo", albedo, "", 1.001, how=how)
     yield Record.at_most("composite edits, deepest hole", 100.0 * hole, "%", 2.0, how=how)
-    how = f"CIELAB hue of body and lobe, {len(turned)} that have one (C*ab above 5)"
+    how = f"descriptors diffuse_hue and specular_hue, {len(turned)} with C*ab above 5"
     share = float(np.mean(np.array(turned) <= 2.0))
-    yield Record("hue kept within 2 degrees, share", share, "", how=how)
+    yield Record.at_least("hue kept within 2 degrees, share", share, "", 1.0, how=how)
     yield Record.at_most("hue, greatest change", max(turned), "deg", 2.0, how=how)
+    how = f"means over more of body and lobe, {len(wider)} with C*ab above 5"
+    share = float(np.mean(np.array(wider) <= 2.0))
+    yield Record("hue kept within 2 degrees, wider, share", share, "", how=how)
 
 
-def hue_change(grid: HalfDiffGrid, before: NDArray[Any], after: NDArray[Any]) -> list[float]:
+def hue_change(
+    grid: HalfDiffGrid, before: NDArray[Any], after: NDArray[Any], whole: bool = False
+) -> list[float]:
     """Degrees by which the hues of the body and of the lobe of f (cells, 3) changed, where both
-    tables have one: chroma above 5 at a luminance of 0.3, and a lobe half as high as the body."""
+    tables have one: chroma above 5, and a lobe as high as the body.
+
+    Where descriptors read them, or over the `whole` of both: theta_h 40 to 55 and theta_d to 20
+    degrees, and theta_d 15 to 50, all phi_d.
+    """
     found = []
-    colours = [_body_and_lobe(grid, values) for values in (before, after)]
+    colours = [_body_and_lobe(grid, values, whole) for values in (before, after)]
     for one, two in zip(*colours, strict=True):
-        if one is None or two is None:
-            continue
-        first, second = (hue(cielab(0.3 * c / float(c @ LUMINANCE))) for c in (one, two))
-        if min(first[1], second[1]) > 5.0:
-            away = abs(first[0] - second[0]) % 360.0
-            found.append(float(min(away, 360.0 - away)))
+        if one is not None and two is not None:
+            (first, pale), (second, paler) = (hue(cielab(colour)) for colour in (one, two))
+            if min(pale, paler) > 5.0:
+                away = abs(first - second) % 360.0
+                found.append(float(min(away, 360.0 - away)))
     return found
 
 
-def _body_and_lobe(grid: HalfDiffGrid, values: NDArray[Any]) -> list[Float64 | None]:
-    """RGB of the body (theta_h 40 to 55, theta_d to 20 degrees) and of the lobe's peak above it
-    (theta_d 15 to 50), over all phi_d; None where there is too little of it."""
-    f = np.asarray(values, np.float64).reshape(*grid.shape, 3)
-    h, d = np.degrees(grid.theta_h), np.degrees(grid.theta_d)
-    body = f[(h > 40.0) & (h < 55.0)][:, d < 20.0].mean(axis=(0, 1, 2))
-    lobe = f[0, (d > 15.0) & (d < 50.0)].mean(axis=(0, 1)) - body
-    seen = float(body @ LUMINANCE) > 0.004
+def _body_and_lobe(grid: HalfDiffGrid, values: NDArray[Any], whole: bool) -> list[Float64 | None]:
+    """RGB of the body's albedo and of the lobe's peak above it, scaled to white; None where there
+    is too little of it."""
+    f = np.asarray(values, np.float64)
+    if whole:
+        table, h, d = f.reshape(*grid.shape, 3), np.degrees(grid.theta_h), np.degrees(grid.theta_d)
+        body = table[(h > 40.0) & (h < 55.0)][:, d < 20.0].mean(axis=(0, 1, 2))
+        peak = table[0, (d > 15.0) & (d < 50.0)].mean(axis=(0, 1))
+    else:
+        readings = reading_rows(grid) @ f
+        body, peak = readings[READINGS.index("body")], readings[READINGS.index("profile 0")]
+    lobe = peak - body
+    dark = float(body @ LUMINANCE) < 0.004
     stands = float(lobe @ LUMINANCE) > 0.004 + float(body @ LUMINANCE) and bool(np.all(lobe > 0.0))
-    return [body if seen else None, lobe if stands else None]
+    return [None if dark else math.pi * body, lobe / lobe.max() if stands else None]
 
 
 def _milliseconds(call: Callable[[], object], repeats: int) -> float:

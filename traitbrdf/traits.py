@@ -430,8 +430,8 @@ class TraitSpace:
         Raises
         ------
         ValueError
-            On an unknown trait, an amount that is not finite, a trait both moved and held, or
-            held traits that forbid the move altogether; the message says what can be reached.
+            On an unknown trait, one named twice, an amount that is not finite, a trait both moved
+            and held, or held traits that forbid the move altogether; the message says what can be reached.
         """
         return self.moved(z, amounts, hold, photoreal).z
 
@@ -464,7 +464,11 @@ class TraitSpace:
         nearest is returned: all scores give way alike.
         """
         start = self._point(z)
-        moved = {self.index(name): _amount(name, value) for name, value in amounts.items()}
+        moved: dict[int, float] = {}
+        for name, value in amounts.items():
+            if (i := self.index(name)) in moved:
+                raise ValueError(f"amounts: expected each trait once, got {self.names[i]!r} twice")
+            moved[i] = _amount(name, value)
         hold = _names(hold)
         held = self._held(hold)
         clash = [self.names[i] for i in moved if i in held]
