@@ -1021,19 +1021,20 @@ def _half_moves(count: int, say: Say) -> Iterator[Record]:
 
 
 def _monotone(count: int) -> Iterator[Record]:
+    """Scores by amounts of quarters, at which strides of a path end too, and by others."""
     library, space, rng = default_library(), default_traits(), np.random.default_rng(1)
-    good = 0
-    for n, i in enumerate(rng.choice(len(library), count, replace=False)):
-        z, name = library.coordinates[i], space.names[n % len(space.names)]
-        scores = [
-            space.score(space.reach(z, {name: amount}).z)[name]
-            for amount in np.linspace(-1.5, 1.5, 13)
-        ]
-        good += bool(np.all(np.diff(scores) >= -1e-3))
-    how = (
-        f"scores rise with the amount, -1.5 to 1.5 in steps of 0.25, {count} starts, traits in turn"
-    )
-    yield Record.at_least("monotone moves", good / count, "", 0.99, how=how)
+    starts = rng.choice(len(library), count, replace=False)
+    for what, amounts in (("", 13), (" (amounts between strides)", 23)):
+        good = 0
+        for n, i in enumerate(starts):
+            z, name = library.coordinates[i], space.names[n % len(space.names)]
+            scores = [
+                space.score(space.reach(z, {name: amount}).z)[name]
+                for amount in np.linspace(-1.5, 1.5, amounts)
+            ]
+            good += bool(np.all(np.diff(scores) >= -1e-3))
+        how = f"scores rise with {amounts} amounts, -1.5 to 1.5, {count} starts, traits in turn"
+        yield Record.at_least(f"monotone moves{what}", good / count, "", 0.99, how=how)
 
 
 def _composites(count: int) -> Iterator[Record]:

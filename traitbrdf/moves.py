@@ -573,7 +573,7 @@ def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64,
         if way >= end:
             break
         for kind in _kinds(ground, task, at):
-            goal = min(way + 0.5 * STRIDE, end)
+            goal = min(0.5 * STRIDE * (math.floor(2.0 * way / STRIDE + 1e-9) + 1.0), end)
             nearer = np.clip(at + share * (kind - at), ground.low, ground.high)
             fits, found = _towards(ground, relaxed[-1], nearer, goal, goal == end)
             if fits:
@@ -622,7 +622,8 @@ def _path(ground: Ground, task: Task, at: Float64, way: float, end: float) -> tu
     """`follow` of one task alone, from where scores have changed by `way` of the rates."""
     stride, least = (STRIDE, 0.2 * STRIDE) if task.strict else (0.5 * STRIDE, 0.05 * STRIDE)
     while way < end and stride > least:
-        goal = min(way + stride, end)
+        # strides end at marks, so that moves by more and by less share their way
+        goal = min(stride * (math.floor(way / stride + 1e-9) + 1.0), end)
         fits, z = _towards(ground, task, at, goal, goal == end)
         if fits:
             at, way, stride = z, goal, min(2.0 * stride, STRIDE)

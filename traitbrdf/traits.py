@@ -431,7 +431,8 @@ class TraitSpace:
         ------
         ValueError
             On an unknown trait, one named twice, an amount that is not finite, a trait both moved
-            and held, or held traits that forbid the move altogether; the message says what can be reached.
+            and held, or held traits that forbid the move altogether; the message says what can be
+            reached.
         """
         return self.moved(z, amounts, hold, photoreal).z
 
@@ -487,7 +488,7 @@ class TraitSpace:
             stopped = f"the {kind} ends here"
             if way >= end:
                 stopped = "no material of the library goes further"
-            elif way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
+            elif hold and way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
                 stopped = "held traits forbid it"
                 at = compromise(self._ground, task, at, min(STRIDE, whole))
         return self._said(start, at, moved, held, stopped)
@@ -849,7 +850,7 @@ def suggest(
     return int(np.argmax(np.einsum("nd,nd->n", rows, np.linalg.solve(precision, rows.T).T)))
 
 
-_NOISE = 1.0  # variance of a label, as large as of the trait itself: people disagree
+_NOISE = 2.0  # variance of a label, twice that of the trait: people disagree
 
 
 def _posterior(grades: Float64, known: Float64) -> tuple[Float64, Float64]:
