@@ -482,13 +482,13 @@ class TraitSpace:
         room = self._room(np.clip(start, self.low, self.high), moved) if photoreal else whole
         end = min(whole, room)
         at, way = follow(self._ground, task, start, end)
-        stopped = ""
+        stopped, many = "", len(moved) > 1 or bool(hold)
         if way < whole:
             kind = "gamut of plausible materials" if photoreal else "gamut"
             stopped = f"the {kind} ends here"
             if way >= end:
                 stopped = "no material of the library goes further"
-            elif hold and way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
+            elif many and way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
                 stopped = "held traits forbid it"
                 at = compromise(self._ground, task, at, min(STRIDE, whole))
         return self._said(start, at, moved, held, stopped)
