@@ -20,9 +20,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import traitbrdf as tb
-from traitbrdf import editing
+from traitbrdf import editing, promises
 from traitbrdf.editing import EditSession
 from traitbrdf.formats import FormatError, read_arrays, write_arrays
+from traitbrdf.gallery import angle_map
 from traitbrdf.models import GGX, Lambert, PerfectMirror
 from traitbrdf.shapes import Mesh
 from traitbrdf.strokes import Stroke, follow
@@ -66,7 +67,7 @@ def over(transport, **arguments):
     session = EditSession(transport.scene, quality="preview", **arguments)
     again = Transport.restored(transport.scene, transport.grid, transport.arrays())
     again._operator = transport._operator  # the rays are cast once
-    session._view.prepared = editing._Prepared(again, False, {})
+    session._view.prepared = editing._Prepared(again, False, {}, again)
     return session
 
 
@@ -390,6 +391,9 @@ def test_the_history_replays_to_the_identical_frame(edit, fresh):
 
 
 def test_a_teapot_design_survives_its_file(edit, fresh, tmp_path, shared_data):
+    # as few basis images as its error needs, as the loaded one will have
+    known = edit._view.prepared
+    edit._view.prepared = editing._promised(known, edit.library, "preview", edit.error, None)
     edit.assign("body", tb.MeasuredBRDF.read(next((shared_data / "rgl").glob("card*.bsdf"))))
     edit.assign("lid", PerfectMirror(0.7) + 0.2 * Lambert((0.5, 0.1, 0.9)))
     edit.assign("spout", "chrome")
@@ -418,6 +422,101 @@ def test_a_teapot_design_survives_its_file(edit, fresh, tmp_path, shared_data):
     same(again.render(), edit.render())
     again.save(tmp_path / "second.tbr")
     assert EditSession.load(tmp_path / "second.tbr").history == edit.history
+
+
+def test_the_more_error_the_fewer_images(prepared_ball):
+    """Held on materials that neither basis nor choice was fitted to; and no exact frame needed."""
+    known = editing._Prepared(prepared_ball, False, {}, prepared_ball)
+    images = []
+    for error in (0.3, 0.1, 0.03, 0.01):
+        found = editing._promised(known, LIBRARY, "preview", error, None)
+        promise, transport = found.promise, found.transport
+        assert promise.basis_images == transport.rank_used <= promise.of == prepared_ball.rank_used
+        assert promise.error_95 <= error or not promise.kept
+        images.append(promise.basis_images)
+        if not promise.kept:
+            assert promise.basis_images == promise.of
+            continue
+        errors = []
+        for z in LIBRARY.coordinates[5::97]:
+            values = EMBEDDING.decode_values(z)
+            frame = transport.shade(0, torch.from_numpy(values[transport.cells]))
+            exact = prepared_ball.shade_exactly(0, values).radiance
+            errors.append(float((frame.radiance - exact).abs().mean() / exact.mean()))
+        assert np.mean(np.array(errors) <= error) >= 0.95, (error, errors)
+    assert images == sorted(images)
+    assert images[0] < images[-1]
+
+
+def test_truncated_transports_are_the_first_images(prepared_ball):
+    table = torch.from_numpy(EMBEDDING.decode_values(LIBRARY.coordinates[7])[prepared_ball.cells])
+    same(prepared_ball.truncated(1000).radiance(0, table), prepared_ball.radiance(0, table))
+    few = prepared_ball.truncated(5)
+    assert few.rank_used == 5
+    basis = prepared_ball.bases[0]
+    expected = (
+        basis.basis[:, :5] @ (basis.projection[:, :5] @ basis.at_cells(table)[..., None])[..., 0].T
+    )
+    np.testing.assert_allclose(few.radiance(0, table), expected, rtol=1e-4, atol=1e-5)
+    # and what it says of its error is what the probes say
+    deviation, level = prepared_ball.probed(table.T[None].permute(2, 1, 0), [5])
+    shown = few.shade(0, table)
+    assert deviation[0, 0, 0] == pytest.approx(shown.deviation, rel=1e-4)
+    assert level[0, 0] == pytest.approx(shown.level, rel=1e-4)
+
+
+def test_a_promised_speed_is_measured(prepared_ball):
+    known = editing._Prepared(prepared_ball, False, {}, prepared_ball)
+    slow = editing._promised(known, LIBRARY, "preview", None, 1.0).promise
+    assert slow.kept
+    assert slow.basis_images == slow.of
+    assert slow.seconds < 1.0
+    fast = editing._promised(known, LIBRARY, "preview", None, 1e7).promise
+    assert not fast.kept
+    assert fast.basis_images == min(promises.LADDER)
+    assert fast.error_95 > slow.error_95
+
+
+def test_no_frame_waits_for_exactness_where_speed_was_asked_for(prepared_ball):
+    session = over(prepared_ball, fps=30.0)
+    noise = np.random.default_rng(0).uniform(0.0, 1.0, (*EMBEDDING.grid_.shape, 3))
+    session.assign("sphere", tb.TabulatedBRDF(EMBEDDING.grid_, noise / 10.0))
+    session.render()
+    assert session.report()["parts"]["sphere"]["tier"] == "basis"
+    assert session.report()["exact_frames"] == 0
+
+
+def test_reference_shows_exact_frames_alone():
+    session = EditSession(ball_scene(10), quality="reference")
+    session.assign("sphere", "blue-plastic")
+    session.render()
+    report = session.report()
+    assert {part["tier"] for part in report["parts"].values()} == {"exact"}
+    assert report["trained_images"] == {}
+    assert report["frame_error"] < 0.02
+
+
+@pytest.mark.parametrize("part", [None, "sphere"])
+def test_angles_that_a_scene_shows(part):
+    """A light behind the viewer shows theta_d of 0 alone; a map from all around nearly all."""
+    session = EditSession(ball_scene(24, ground=False))
+    seen = session.angles(part)
+    assert seen.share.shape == EMBEDDING.grid_.shape[:2]
+    assert seen.share.sum() == pytest.approx(1.0)
+    assert (seen.share >= 0.0).all()
+    half, most = seen.within(0.5), seen.within(0.9)
+    assert 0.0 < half[0] < most[0] < 90.0
+    assert 0.0 < half[1] < most[1] < 90.0
+    flash = tb.EnvironmentMap(np.zeros((16, 32, 3), np.float32))
+    camera = tb.Camera.orbit(0.0, 0.0)
+    lamp = tb.PointLight(position=tuple(camera.position(tb.sphere(), 24, 24)), intensity=(9.0,) * 3)
+    scene = tb.Scene(tb.sphere(), flash, lights=[lamp], camera=camera, size=24)
+    lit = EditSession(scene).angles()
+    assert lit.within(0.99)[1] < 8.0
+    assert lit.cells < 0.3 < seen.cells
+    picture = angle_map(lit, 90)
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
 
 
 def test_a_sphere_design_survives_its_file(tmp_path):
@@ -642,13 +741,13 @@ def test_small_parts_bear_more_error(fresh):
     counts = np.bincount(scene.pixel_part, minlength=len(scene.parts))
     allowed = np.array([editing.trusted_error(scene, i) for i in range(len(counts))])
     share = counts / counts[: len(scene.shape.parts)].sum()
-    assert (allowed[share >= 0.1] == editing.TRUSTED * editing.EXACT_ABOVE).all()
-    assert (allowed <= 3.0 * editing.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed[share >= 0.1] == promises.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed <= 3.0 * promises.TRUSTED * editing.EXACT_ABOVE).all()
     small = share < 0.1
     assert small.any()
-    assert (allowed[small] > editing.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed[small] > promises.TRUSTED * editing.EXACT_ABOVE).all()
     # together they add no more to the frame's error than a part of a tenth of the shape may
-    assert (allowed * share)[small].max() <= 0.1 * editing.TRUSTED * editing.EXACT_ABOVE
+    assert (allowed * share)[small].max() <= 0.1 * promises.TRUSTED * editing.EXACT_ABOVE
 
 
 def test_the_report_says_what_was_left_out(prepared_ball):
@@ -1462,7 +1561,7 @@ def test_a_preparation_is_found_again(cache):
     same(second.render(), frame)
     assert second.report()["prepared_from"] == "cache"
     assert first.report()["prepared_from"] == "scratch"
-    assert told == [("reading", 1.0)]
+    assert told == [("compiling", 0.0), ("reading", 1.0)]
     assert file.stat().st_mtime > 1e9  # it has been used
     for session in (first, second):
         session.assign("sphere", "gold-polished")
@@ -1678,7 +1777,7 @@ def true_error(radiance, truth):
 
 def lacking_session(lacking, monkeypatch, **arguments):
     built, known = lacking
-    monkeypatch.setitem(editing.QUALITIES, "preview", (24, 1.0))
+    monkeypatch.setitem(promises.QUALITIES, "preview", (24, 1.0))
     return over(built, **arguments), known
 
 
@@ -1691,7 +1790,7 @@ def test_edits_to_a_family_that_the_basis_has_not_seen_are_detected(lacking):
         measured.append(frame.error)
     beyond = np.asarray(true) > editing.EXACT_ABOVE
     assert beyond.sum() >= 5
-    assert (np.asarray(measured)[beyond] > editing.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (np.asarray(measured)[beyond] > promises.TRUSTED * editing.EXACT_ABOVE).all()
 
 
 def test_what_is_shown_of_them_is_right(lacking, monkeypatch):

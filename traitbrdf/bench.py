@@ -39,12 +39,13 @@ from traitbrdf.brdf import (
 )
 from traitbrdf.descriptors import LUMINANCE, READINGS, cielab, hue, reading_rows
 from traitbrdf.directions import from_half_diff_angles, to_local
-from traitbrdf.editing import EXACT_ABOVE, QUALITIES, TRUSTED, EditSession, trusted_error
+from traitbrdf.editing import EXACT_ABOVE, EditSession, trusted_error
 from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
 from traitbrdf.gallery import own_colours
 from traitbrdf.lights import EnvironmentMap, texel_moments
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.profiles import HIGHLIGHT
+from traitbrdf.promises import QUALITIES, TRUSTED
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import sphere, teapot
 from traitbrdf.traits import RELATED, Trait, TraitSpace, default_traits, suggest

@@ -89,6 +89,12 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
     render.set_defaults(run=_render)
 
+    angles = commands.add_parser("angles", help="which angles of a BRDF a scene shows at all")
+    _add_scene(angles)
+    angles.add_argument("--part", help="of this part alone (default: of the shape)")
+    angles.add_argument("--out", type=Path, required=True, help="picture (.png)")
+    angles.set_defaults(run=_angles)
+
     studio = commands.add_parser("studio", help="paint live in a page on this machine")
     _add_scene(studio)
     studio.add_argument("--mesh", type=Path, help="mesh file (.obj, .ply, .glb, ...) to paint on")
@@ -360,6 +366,16 @@ def _material(name: str) -> str | Reflectance:
         return tb.MeasuredBRDF.read(name)
     tb.default_library().index(name)
     return name
+
+
+def _angles(given: argparse.Namespace) -> int:
+    from traitbrdf.gallery import angle_map
+
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    seen = tb.EditSession(_scene(given)).angles(given.part)
+    write_png(given.out, angle_map(seen))
+    print(json.dumps(seen.as_dict(), indent=2))
+    return 0
 
 
 def _gallery(given: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import itertools
 import json
 import math
 import os
@@ -45,17 +46,20 @@ from traitbrdf.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.embedding import BRDFEmbedding, Library, default_library
 from traitbrdf.formats import FormatError, atomic_path, read_arrays, unknown_name, write_arrays
 from traitbrdf.lights import DirectionalLight, EnvironmentMap, Light, LightTree, PointLight
+from traitbrdf.promises import QUALITIES, TRUSTED, Promise, keep, quality_for
 from traitbrdf.quadrature import light_tree
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
 from traitbrdf.traits import GROUPS, Move, Trait, TraitSpace, default_traits
 from traitbrdf.transport import (
+    AnglesSeen,
     Draft,
     PartFrame,
     Progress,
     Training,
     Transport,
+    angles_seen,
     training_tables,
 )
 
@@ -63,19 +67,8 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-QUALITIES: dict[str, tuple[int, float]] = {
-    "preview": (40, 0.7),
-    "interactive": (96, 1.0),
-    "accurate": (144, 1.5),
-}
-"""Basis images and resolution of the light for each quality."""
-
 EXACT_ABOVE = 0.01
 """The error that every shown part has to meet by its own measurement, if none is asked for."""
-
-TRUSTED = 0.7
-"""The basis is used where its measured error is at most this share of the error asked for: some
-dozens of probes are a noisy measurement."""
 
 SMALL_PART = 0.1
 """Of parts that are a smaller share of the shape's pixels more error is borne, up to three times
@@ -92,6 +85,9 @@ DRAFT_SIZE = 128
 
 FRAMES_KEPT = 1 << 27
 """Bytes of finished parts that are kept, so that what is undone is shown again as it was."""
+
+_CALIBRATED = 64
+"""Materials that a promise is measured on."""
 
 CACHE_BYTES = 2_000_000_000
 """Preparations on disk take at most so many bytes, unless TRAITBRDF_CACHE_BYTES says otherwise."""
@@ -255,12 +251,14 @@ class _LightTrees:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """A transport, whether it came from the cache, and the materials of the parts that it was
-    prepared for no others of (by index)."""
+    """A transport, whether it came from the cache, the materials of the parts that it was prepared
+    for no others of (by index), itself before it was cut down for a promise, and the promise."""
 
     transport: Transport
     cached: bool
     fixed: Mapping[int, Material]
+    whole: Transport
+    promise: Promise | None = None
 
 
 class _Preparation:
@@ -369,14 +367,14 @@ class _Canvas:
         # the share of the pixel that shows the backdrop is a part of the sum as well
         self._mixed = (several | (scene.uncovered > 0.0))[scene.pixels]
         self._patches: dict[int | None, tuple[torch.Tensor, list[Any]]] = {}
-        self._drawn: list[PartFrame] = []
+        self.drawn: list[PartFrame] = []
         self._copies: list[Float32] = []
         self._image = self._backdrop
         self.changed: list[int] = []
 
     def draw(self, frames: list[PartFrame]) -> None:
         """Bring the image up to the parts' frames; `changed` are those that were drawn."""
-        drawn, self._drawn = self._drawn, []  # what is cut off half way is drawn as a whole again
+        drawn, self.drawn = self.drawn, []  # what is cut off half way is drawn as a whole again
         if drawn:
             pairs = zip(frames, drawn, strict=True)
             self.changed = [i for i, (new, old) in enumerate(pairs) if new is not old]
@@ -384,7 +382,7 @@ class _Canvas:
         else:
             self.changed = list(range(len(frames)))
             self._image = self._transport.compose(frames).reshape(-1, 3)
-        self._drawn = frames
+        self.drawn = frames
 
     def redraw(self, changed: list[int], frames: list[PartFrame]) -> None:
         """Draw the pixels of the parts `changed`."""
@@ -477,12 +475,13 @@ def _size(shown: _Shown) -> int:
     return shown.frame.radiance.numel() * shown.frame.radiance.element_size()
 
 
-def trusted_error(scene: Scene, part: int) -> float:
-    """The measured error up to which a session shows a part by the basis, if none is asked for."""
+def trusted_error(scene: Scene, part: int, asked: float | None = None) -> float:
+    """The measured error up to which a session shows a part by the basis."""
     span = scene.part_slice(part)
     shape = scene.part_slice(len(scene.shape.parts) - 1).stop
     share = max(span.stop - span.start, 1) / max(shape, 1)
-    return TRUSTED * EXACT_ABOVE * min(max(1.0, math.sqrt(SMALL_PART / share)), 3.0)
+    error = EXACT_ABOVE if asked is None else asked
+    return TRUSTED * error * min(max(1.0, math.sqrt(SMALL_PART / share)), 3.0)
 
 
 class EditSession:
@@ -491,10 +490,19 @@ class EditSession:
     Parameters
     ----------
     scene : Scene
-    quality : "preview", "interactive" or "accurate"
+    quality : "preview", "interactive", "accurate", "reference" or None
+        None is what `error` needs, "interactive" without one. "reference" shows exact frames
+        alone, which take seconds.
     error : float or None
-        The mean relative L1 that every shown part has to meet by its own measurement; parts that
-        do not are rendered without the basis, which takes seconds, and taught to it. None is 0.01.
+        The mean relative L1 that every shown part has to meet by its own measurement (a part
+        smaller than a tenth of the shape up to three times as much); parts that do not are
+        rendered without the basis, which takes seconds, and taught to it. Of the basis as few
+        images are used as 95 % of materials need for it: the more error, the faster. None is
+        0.01, and all images.
+    fps : float or None
+        Frames a second that an edit of the whole object shall reach on this machine: so many
+        images of the basis are used, and no frame is exact. The error that it costs is measured
+        and reported. Not together with `error`.
     library, embedding, traits : what to edit with; None is what the package ships
     device : torch device for frames
     seed : int, of the preparation's random choices
@@ -513,8 +521,9 @@ class EditSession:
     def __init__(
         self,
         scene: Scene,
-        quality: str = "interactive",
+        quality: str | None = None,
         error: float | None = None,
+        fps: float | None = None,
         library: Library | None = None,
         traits: TraitSpace | None = None,
         device: str | torch.device = "cpu",
@@ -524,12 +533,17 @@ class EditSession:
     ) -> None:
         if not isinstance(scene, Scene):
             raise TypeError(f"scene: expected a Scene, got {scene!r}")
+        for name, asked in (("error", error), ("fps", fps)):
+            if asked is not None and not (math.isfinite(asked) and asked > 0.0):
+                raise ValueError(f"{name}: expected a positive number, got {asked!r}")
+        if error is not None and fps is not None:
+            raise ValueError(f"expected error or fps, got both: error={error!r}, fps={fps!r}")
+        quality = quality_for(error) if quality is None else quality
         if quality not in QUALITIES:
             raise ValueError(unknown_name("quality", quality, tuple(QUALITIES)))
-        if error is not None and not (math.isfinite(error) and error > 0.0):
-            raise ValueError(f"error: expected a positive number, got {error!r}")
         self.quality = quality
         self.error = error
+        self.fps = fps
         self.library = default_library() if library is None else library
         self.embedding = self.library.embedding
         self.traits = default_traits() if traits is None else traits
@@ -991,10 +1005,10 @@ class EditSession:
         scene, fixed = view.scene, {}
         if scene.ground and scene.parts[-1] not in self._edited and view.prepared is None:
             fixed[len(scene.parts) - 1] = self._materials[scene.parts[-1]]
-        known = None if view.prepared is None else view.prepared.transport
+        known = None if view.prepared is None else view.prepared.whole
         work = functools.partial(
-            _prepare, scene, self.library, self.quality, self.seed, self.device, self._cache,
-            fixed, known,
+            _prepare, scene, self.library, self.traits, self.quality, self.error, self.fps,
+            self.seed, self.device, self._cache, fixed, known,
         )  # fmt: skip
         return _Preparation(work, publish, self._progress, weakref.ref(self))
 
@@ -1215,10 +1229,13 @@ class EditSession:
 
     def _allowed(self, view: _View, index: int) -> float:
         """The measured error up to which a part is shown by the basis."""
-        if self.error is not None:
-            return TRUSTED * self.error
-        # if nothing is asked for, nothing is gained by exact frames that err as much
-        return max(trusted_error(view.scene, index), view.floor.get(index, 0.0))
+        if self.quality == "reference":
+            return -1.0
+        if self.fps is not None:
+            return math.inf
+        # nothing is gained by exact frames that err as much
+        allowed = trusted_error(view.scene, index, self.error)
+        return max(allowed, view.floor.get(index, 0.0)) if self.error is None else allowed
 
     def _exactly(
         self,
@@ -1316,6 +1333,9 @@ class EditSession:
         "exact", without the basis. ``exact_frames`` counts those, ``trained_images`` what the
         bases have taken in.
 
+        ``promise`` is what was picked for the error or the speed that was asked for, and what that
+        measured (`traitbrdf.promises.Promise`).
+
         ``left_out`` is what the frame did not need, and what that saved where it is measured: here
         and now, both ways. A frame is rendered (and the scene prepared) if that is to be done.
         """
@@ -1333,6 +1353,9 @@ class EditSession:
             prepared = view.prepared
             return {
                 "quality": self.quality,
+                "promise": None
+                if prepared is None or prepared.promise is None
+                else prepared.promise.as_dict(),
                 "frame_error": _measured(view, transport),
                 "error_asked": EXACT_ABOVE if self.error is None else self.error,
                 "seconds": dict(view.times),
@@ -1352,6 +1375,14 @@ class EditSession:
                 "parts": parts,
                 "history": self.history,
             }
+
+    def angles(self, part: str | None = None) -> AnglesSeen:
+        """Which angles of the BRDF of a part (None: of the shape) this scene shows at all.
+
+        What light and view leave out, no edit changes: `traitbrdf.gallery.angle_map` draws it.
+        """
+        index = None if part is None else self.part(part)
+        return angles_seen(self.scene, self.embedding.grid_, index)
 
     def _part_report(self, part: str, material: Material, shown: _Shown) -> dict[str, Any]:
         return {
@@ -1469,6 +1500,7 @@ class EditSession:
             "anywhere": [one.anywhere if one.framing == framing else "" for one in said],
             "quality": self.quality,
             "error": self.error,
+            "fps": self.fps,
             "seed": self.seed,
         }
         if self.traits is not default_traits():
@@ -1500,6 +1532,7 @@ class EditSession:
                 )
             scene = _saved_scene(header, arrays)
             given = {key: header[key] for key in ("quality", "error", "seed")}
+            given["fps"] = header.get("fps")
             # what is wrong in the file is no mistake of the caller
             cls(scene, **given, cache=False)
         with _design_errors(path):
@@ -1644,6 +1677,60 @@ def _timed(call: Callable[[], object], device: torch.device) -> float:
 def _prepare(
     scene: Scene,
     library: Library,
+    traits: TraitSpace,
+    quality: str,
+    error: float | None,
+    fps: float | None,
+    seed: int,
+    device: torch.device,
+    cache: _Cache | None,
+    fixed: Mapping[int, Material],
+    known: Transport | None,
+    report: Progress,
+) -> _Prepared:
+    """The transport of a scene, for edits of all parts but those that are `fixed`, as large as a
+    promise of error or speed needs; what is `known` of it need not be computed again."""
+    report("compiling", 0.0)
+    traits.reach(library.coordinates[0], {traits.names[0]: 0.1})  # else the first stroke waits
+    prepared = _transport(scene, library, quality, seed, device, cache, fixed, known, report)
+    if quality == "reference" or (error is None and fps is None):
+        return prepared
+    report("measuring", 1.0)
+    return _promised(prepared, library, quality, error, fps)
+
+
+def _promised(
+    prepared: _Prepared, library: Library, quality: str, error: float | None, fps: float | None
+) -> _Prepared:
+    """A transport cut down to what a promise of error or speed needs."""
+    whole = prepared.whole
+    scene, device, cells, embedding = whole.scene, whole.device, whole.cells, library.embedding
+    used = set(trained_members(library))
+    others = [z for i, z in enumerate(library.coordinates) if i not in used]
+    some = [others[i] for i in np.linspace(0, len(others) - 1, _CALIBRATED).astype(int)]
+    tables = [embedding.decode_values(z)[cells].T for z in some]  # (3, cells)
+    stacked = torch.from_numpy(np.stack(tables, axis=2).swapaxes(0, 1).copy()).to(device)
+    canvas, turn = _Canvas(whole), itertools.cycle(some)
+
+    def frame(transport: Transport) -> Float32:
+        """Of an edited material on all parts of the shape."""
+        values = Material(next(turn), np.zeros(3)).values(embedding, cells)
+        table = torch.from_numpy(values).to(device)
+        frames = [transport.shade(i, table) for i in range(len(scene.shape.parts))]
+        still = canvas.drawn[len(frames) :]
+        if not still:
+            still = [transport.shade(i, table) for i in range(len(frames), len(scene.parts))]
+        canvas.draw([*frames, *still])
+        return canvas.image()
+
+    borne = np.array([trusted_error(scene, i, 1.0) for i in range(len(scene.parts))])
+    transport, promise = keep(whole, stacked, borne, frame, quality, error, fps)
+    return replace(prepared, transport=transport, promise=promise)
+
+
+def _transport(
+    scene: Scene,
+    library: Library,
     quality: str,
     seed: int,
     device: torch.device,
@@ -1652,8 +1739,7 @@ def _prepare(
     known: Transport | None,
     report: Progress,
 ) -> _Prepared:
-    """The transport of a scene, for edits of all parts but those that are `fixed`; what is
-    `known` of it need not be computed again."""
+    """The transport of a scene with all images of a quality, computed or read."""
     rank, resolution = QUALITIES[quality]
     grid = library.embedding.grid_
     tables = {part: material.values(library.embedding) for part, material in fixed.items()}
@@ -1672,7 +1758,7 @@ def _prepare(
                 cache.drop(key)
             else:
                 report("reading", 1.0)
-                return _Prepared(transport, True, some)
+                return _Prepared(transport, True, some, transport)
     report("tables", 0.0)
     training = _training(library, seed)
     report("tables", 0.0)
@@ -1682,7 +1768,7 @@ def _prepare(
         transport = known.freed(training, seed, report)
     if cache is not None and key is not None:
         cache.write_behind(key, transport.arrays())
-    return _Prepared(transport, False, fixed)
+    return _Prepared(transport, False, fixed, transport)
 
 
 def trained_members(library: Library) -> list[int]:

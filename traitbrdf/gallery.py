@@ -1,9 +1,10 @@
-"""Pictures of materials side by side: spheres under one light, labelled, as one sheet."""
+"""Pictures of materials side by side, and of the angles that a scene shows of them."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from traitbrdf.lights import EnvironmentMap
 from traitbrdf.quadrature import Operator
 from traitbrdf.scene import Scene
 from traitbrdf.shapes import sphere
+
+if TYPE_CHECKING:
+    from traitbrdf.transport import AnglesSeen
 
 Float32 = NDArray[np.float32]
 
@@ -96,4 +100,35 @@ def sheet(
         for j in range(len(row)):
             paper.paste(Image.fromarray(shown[at]), (margin + j * size, top + i * size))
             at += 1
+    return np.asarray(paper)
+
+
+def angle_map(seen: AnglesSeen, height: int = 360) -> NDArray[np.uint8]:
+    """A picture (H, W, 3), sRGB bytes, of the angles of a BRDF that a scene shows: the brighter the
+    more light is reflected by them, over four decades; white where nothing is seen."""
+    grid = seen.grid
+    theta_h, theta_d = np.degrees(grid.theta_h), np.degrees(grid.theta_d)
+    decades = np.log10(np.maximum(seen.density, 1e-30))
+    level = np.clip(1.0 + decades / 4.0, 0.0, 1.0)[..., None]
+    ink = 255.0 * np.clip(level * [2.2, 1.5, 1.1] - [0.0, 0.35, 0.6], 0.0, 1.0)
+    colour = np.where(level > 0.0, ink, 255.0).astype(np.uint8)
+    # an axis each of degrees, theta_h upwards
+    degrees = (np.arange(height) + 0.5) * 90.0 / height
+    up = np.abs(theta_h[None, :] - degrees[::-1, None]).argmin(axis=1)
+    along = np.abs(theta_d[None, :] - degrees[:, None]).argmin(axis=1)
+    left, top, below = 64, 2 * _LINE, 3 * _LINE
+    paper = Image.new("RGB", (left + height + 24, top + height + below), (255, 255, 255))
+    paper.paste(Image.fromarray(colour[up][:, along]), (left, top))
+    draw = ImageDraw.Draw(paper)
+    draw.rectangle((left - 1, top - 1, left + height, top + height), outline=(0, 0, 0))
+    for angle in range(0, 91, 15):
+        at = round(angle * height / 90.0)
+        draw.text((left + at, top + height + 4), str(angle), fill=(0, 0, 0), anchor="ma")
+        draw.text((left - 6, top + height - at), str(angle), fill=(0, 0, 0), anchor="rm")
+    draw.text((left + height // 2, top + height + 24), "theta_d", fill=(0, 0, 0), anchor="ma")
+    draw.text((4, top + height // 2), "theta_h", fill=(0, 0, 0), anchor="lm")
+    most = seen.within(0.9)
+    told = f"{100.0 * seen.cells:.0f} % of the angles show; 90 % of the light: theta_h below "
+    told += f"{most[0]:.0f}, theta_d below {most[1]:.0f}"
+    draw.text((4, 4), told, fill=(0, 0, 0))
     return np.asarray(paper)

@@ -25,6 +25,7 @@ outside the fit alone would overstate the error of small parts, of which the fit
 from __future__ import annotations
 
 import concurrent.futures
+import copy
 import math
 import threading
 from collections.abc import Mapping, Sequence
@@ -254,6 +255,63 @@ class Transport:
                 other.parts[part] = self.parts[part]
         other._compress_groups(training, {}, known, seed, progress)
         return other
+
+    def truncated(self, rank: int) -> Transport:
+        """This transport with at most the first `rank` images of each basis: faster, and less
+        exact. This one stays as it is."""
+        other = copy.copy(self)
+        other.rank = min(rank, self.rank)
+        other.parts, other._projected = list(self.parts), ()
+        other.bases = [
+            replace(
+                basis,
+                basis=basis.basis[:, :rank].contiguous(),
+                rows=torch.cat([basis.projection[:, :rank], basis.probes], dim=1),
+            )
+            for basis in self.bases
+        ]
+        return other
+
+    @property
+    def rank_used(self) -> int:
+        """The most images of any basis."""
+        return max((basis.rank for basis in self.bases), default=0)
+
+    def probed(self, tables: torch.Tensor, ranks: Sequence[int]) -> tuple[Float64, Float64]:
+        """What frames of `truncated` would differ by on the probes, and what these show.
+
+        Parameters
+        ----------
+        tables : (len(cells), 3, T) float32, each on all parts
+        ranks : numbers of images
+
+        Returns
+        -------
+        deviation : (len(ranks), parts, T) mean |I - I_exact| of each part's probes
+        level : (parts, T) their mean I_exact; both are 0 for parts that were prepared for one
+            material alone
+        """
+        count = tables.shape[2]
+        deviation = torch.zeros((len(ranks), len(self.parts), count), device=self.device)
+        level = torch.zeros((len(self.parts), count), device=self.device)
+        for basis in self.bases:
+            if self.fixed.intersection(basis.parts):
+                continue
+            seen = tables if basis.place is None else tables[basis.place]
+            for c in range(3):
+                own = c if len(basis.rows) == 3 else 0
+                found = basis.rows[own] @ seen[:, c]
+                for index in basis.parts:
+                    part = self.parts[index]
+                    if part is None:
+                        continue
+                    exact = found[basis.rank :][part.exact]
+                    images = basis.basis[part.span][part.probes[own]]
+                    level[index] += exact.mean(dim=0) / 3.0
+                    for i, rank in enumerate(ranks):
+                        shown = (images[:, :rank] @ found[: min(rank, basis.rank)]).clamp_min(0.0)
+                        deviation[i, index] += (shown - exact).abs().mean(dim=0) / 3.0
+        return deviation.double().cpu().numpy(), level.double().cpu().numpy()
 
     def _compress_groups(
         self,
@@ -772,6 +830,81 @@ class Transport:
         deviation = sum(n * f.deviation for n, f in zip(size, frames, strict=True))
         level = sum(n * f.level for n, f in zip(size, frames, strict=True))
         return deviation / level if level > 0.0 else deviation
+
+
+@dataclass(frozen=True)
+class AnglesSeen:
+    """Which angles of a BRDF a scene can show at all: what lighting and view leave out, no edit
+    changes and no picture tells.
+
+    Attributes
+    ----------
+    grid : of the tables
+    share : (n_theta_h, n_theta_d)
+        Share of the light that a white diffuse surface sends to the image, by the angles by which
+        it is reflected; sums to 1, all phi_d together. 0 where nothing is seen.
+    fragments : how many it was measured on
+    """
+
+    grid: HalfDiffGrid
+    share: Float64
+    fragments: int
+
+    @property
+    def density(self) -> Float64:
+        """(n_theta_h, n_theta_d) the share by square degree, over that of the densest place."""
+        h, d = np.degrees(self.grid.theta_h), np.degrees(self.grid.theta_d)
+        found: Float64 = self.share / (np.gradient(h)[:, None] * np.gradient(d)[None, :])
+        return found / max(float(found.max()), 1e-300)
+
+    @property
+    def cells(self) -> float:
+        """The share of pairs of theta_h and theta_d that show: whose density is above 1e-4."""
+        return float(np.mean(self.density > 1e-4))
+
+    def within(self, share: float = 0.9) -> tuple[float, float]:
+        """theta_h and theta_d in degrees below which a share of the light is reflected."""
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"share: expected 0 to 1, got {share!r}")
+        found = []
+        for angles, axis in ((self.grid.theta_h, 1), (self.grid.theta_d, 0)):
+            total = np.cumsum(self.share.sum(axis=axis))
+            place = int(np.searchsorted(total, share * total[-1]))
+            found.append(math.degrees(float(angles[min(place, len(angles) - 1)])))
+        return found[0], found[1]
+
+    def as_dict(self) -> dict[str, Any]:
+        half, most = self.within(0.5), self.within(0.9)
+        return {
+            "cells_seen": self.cells,
+            "theta_h_degrees": {"50 % of the light below": half[0], "90 % below": most[0]},
+            "theta_d_degrees": {"50 % of the light below": half[1], "90 % below": most[1]},
+            "fragments": self.fragments,
+        }
+
+
+def angles_seen(
+    scene: Scene, grid: HalfDiffGrid, part: int | None = None, count: int = 384, seed: int = 0
+) -> AnglesSeen:
+    """Which angles of the BRDF of a part (None: of the shape) a scene shows, from exact rows of
+    some fragments; no preparation is needed.
+
+    Raises
+    ------
+    ValueError
+        If nothing of it is in the picture.
+    """
+    parts = range(len(scene.shape.parts)) if part is None else [part]
+    spans = [scene.part_slice(i) for i in parts]
+    all_of = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+    if not len(all_of):
+        raise ValueError("angles: expected a part that is in the picture, got one that is not")
+    rng = np.random.default_rng(seed)
+    chosen = np.sort(rng.permutation(all_of)[:count])
+    rows = Operator(scene, grid).rows(chosen)
+    light = rows.mean(axis=1).sum(axis=0, dtype=np.float64)
+    share = np.maximum(light, 0.0).reshape(grid.shape).sum(axis=2)
+    return AnglesSeen(grid, share / max(float(share.sum()), 1e-300), len(chosen))
 
 
 class Draft:
