@@ -1,4 +1,4 @@
-"""The command line: ``traitbrdf demo | paint | render | studio | info | bench``.
+"""The command line: ``traitbrdf demo | paint | render | angles | gallery | studio | info | bench``.
 
 Exit status: 0 done, 1 failed with one readable line, 2 wrong usage.
 """
