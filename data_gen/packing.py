@@ -14,10 +14,11 @@ from scipy.optimize import nnls
 from data_gen.families import materials
 from data_gen.labels import TRAITS, grading, labels
 from data_gen.tables import Progress, Tables
+from traitbrdf.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.descriptors import PROFILE, READINGS, describe, read, reading_rows
 from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
 from traitbrdf.moves import Grades, Optics, Readings
-from traitbrdf.profiles import CORE, HIGHLIGHT
+from traitbrdf.profiles import HIGHLIGHT
 from traitbrdf.traits import TraitSpace
 
 COUNT = 2040
@@ -97,19 +98,25 @@ def build(
     }
 
 
+ENERGY = (0, 9, 15)
+"""Angles of `brdf.ALBEDO_ANGLES` at which moves watch the albedo: 0, 48 and 80 degrees."""
+
+
 def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
-    """How readings are had of coordinates: those that take many cells, the albedo and the flux
-    into a gloss meter, by few that give the same on the members.
+    """How readings are had of coordinates: those that take many cells, albedos and the flux into a
+    gloss meter, by few that give the same on the members.
 
     Cells and weights are found by non-negative least squares of relative errors (Lawson & Hanson
     1974, chapter 23), so that nothing can come out negative.
     """
-    rows = reading_rows(embedding.grid_).toarray()
+    grid = embedding.grid_
+    albedos = albedo_operator(grid, np.asarray(ALBEDO_ANGLES)[list(ENERGY)]).toarray()
+    rows = np.vstack([reading_rows(grid).toarray(), albedos])
     some = coordinates[:: max(len(coordinates) // 700, 1)]
     members = np.clip(some, embedding.low_, embedding.high_)
     tables = np.stack([embedding.decode_values(z).mean(axis=1) for z in members])
     rng = np.random.default_rng(0)
-    for i in range(len(READINGS)):
+    for i in range(len(rows)):
         used = np.flatnonzero(rows[i])
         if len(used) > 40:
             relative = tables[:, used] / np.maximum(tables @ rows[i], 1e-6)[:, None]
@@ -120,13 +127,12 @@ def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
             rows[i] = 0.0
             rows[i, used[chosen]] = found
     # the cells of the highlight, which decoding mends: all from the middle to its rim
-    grid, last = embedding.grid_, READINGS.index(f"profile {len(PROFILE) - 1}")
-    ends = np.flatnonzero(rows[last])
+    count = len(READINGS)
     per = grid.n_theta_d * grid.n_phi_d
-    nodes = np.append(np.flatnonzero(grid.theta_h <= HIGHLIGHT), ends[0] // per)
-    columns = nodes[:, None] * per + ends % per
+    profile = np.array([np.flatnonzero(row) for row in rows[count - len(PROFILE) : count]])
+    columns = np.flatnonzero(grid.theta_h <= HIGHLIGHT)[:, None] * per + profile[0] % per
+    outer = profile[np.radians(PROFILE) > HIGHLIGHT]
     kept = np.union1d(np.flatnonzero(rows.any(axis=0)), columns)
     log_rows, mean = embedding.log_rows(kept)
-    share = embedding.trend_share(columns.ravel()).reshape(columns.shape)
-    core = int(np.sum(grid.theta_h <= CORE))
-    return Readings(log_rows, mean, rows[:, kept], np.searchsorted(kept, columns), share, core)
+    inner, beyond = (np.searchsorted(kept, cells) for cells in (columns, outer))
+    return Readings(log_rows, mean, rows[:count, kept], inner, beyond, rows[count:, kept])

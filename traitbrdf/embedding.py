@@ -787,11 +787,6 @@ class BRDFEmbedding:
         rows = np.einsum("nm,cmk->cnk", self.components_[at].astype(np.float64), self._mixing)
         return rows, self.mean_[at].astype(np.float64)
 
-    def trend_share(self, cells: ArrayLike) -> Float64:
-        """Of what its profile rises, the share that each cell of `grid_` may have risen
-        (`profiles.Profiles`)."""
-        return self._profiles.share.ravel()[self._cell_indices(cells)].astype(np.float64)
-
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
         """The table at coordinates `z` (k,), on the embedding's grid or any other."""
         values = self.decode_values(z).reshape(*self.grid_.shape, 3)

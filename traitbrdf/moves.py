@@ -200,18 +200,18 @@ class Readings(NamedTuple):
     ----------
     rows, mean : (3, cells, k) and (cells,), log(f + FLOOR) of a channel: rows @ z + mean
     weights : (readings, cells)
-    columns : (n, c) int64, the cells from the middle to the rim of the highlight, and the last of
-        the profile, for each theta_d that it has
-    share : (n, c), of the trend of a column what it may have risen (`profiles.Profiles`)
-    core : how many of the n the trend is counted from
+    columns : (n, c) int64, the cells from the middle to the rim of the highlight, for each theta_d
+        that the profile has
+    outer : (m, c) int64, cells of the profile beyond
+    energy : (angles, cells), directional albedos at angles from 0 to 80 degrees
     """
 
     rows: Float64
     mean: Float64
     weights: Float64
     columns: NDArray[np.int64]
-    share: Float64
-    core: int
+    outer: NDArray[np.int64]
+    energy: Float64
 
     def at(self, z: Float64) -> Float64:
         """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
@@ -222,22 +222,30 @@ class Readings(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _near(
-    z: Any, rows: Any, mean: Any, weights: Any, columns: Any, share: Any, core: Any, sloped: Any
+    z: Any, rows: Any, mean: Any, weights: Any, columns: Any, outer: Any, energy: Any, sloped: Any
 ) -> Any:
     """Readings (readings, 3) at a point and their slopes (readings, 3, k), 0 if they are not
-    wanted; by how much (log f) the middle of the highlight is darker there than what is around it,
-    before decoding mends it, and its slope (k,)."""
+    wanted; what decoding mends there (2,) and its slopes (2, k): by how much (log f) the middle of
+    the highlight is darker than what is around it, and the log of the greatest albedo."""
     count, cells = weights.shape
     value, slopes = np.zeros((count, 3)), np.zeros((count, 3, len(z)))
-    log, raised = np.empty((3, cells)), np.empty((3, cells))
+    mended, steep = np.zeros(2), np.zeros((2, len(z)))
+    raised, source = np.empty((3, cells)), np.empty((3, cells), np.int64)
     for c in range(3):
         for n in range(cells):
-            log[c, n] = mean[n]
+            log = mean[n]
             for k in range(len(z)):
-                log[c, n] += rows[c, n, k] * z[k]
-            raised[c, n] = math.exp(min(log[c, n], 30.0))
-    hole, inward = _hole(columns, raised, rows, sloped)
-    source, extra, first, last = _mend(columns, share, core, log, raised)
+                log += rows[c, n, k] * z[k]
+            raised[c, n] = math.exp(min(log, 30.0))
+            source[c, n] = n
+    mended[0], steep[0] = _hole(columns, outer, raised, rows, sloped)
+    # no hole in the highlight: as high as what follows, of which it then has the slope too
+    for c in range(3):
+        for j in range(columns.shape[1]):
+            for i in range(len(columns) - 2, -1, -1):
+                n, after = columns[i, j], columns[i + 1, j]
+                if raised[c, n] < raised[c, after]:
+                    raised[c, n], source[c, n] = raised[c, after], source[c, after]
     for i in range(count):
         for n in range(cells):
             weight = weights[i, n]
@@ -248,79 +256,58 @@ def _near(
                         by, s = weight * raised[c, n], source[c, n]
                         for k in range(len(z)):
                             slopes[i, c, k] += by * rows[c, s, k]
-                        if extra[c, n] != 0.0:
-                            to, since = last[c, n], first[c, n]
-                            for k in range(len(z)):
-                                rise = rows[c, to, k] - rows[c, since, k]
-                                slopes[i, c, k] += by * extra[c, n] * rise
-    brightest = 0
-    for c in range(3):
-        if value[0, c] > value[0, brightest]:
-            brightest = c
-    whole = value[0, brightest]
+    whole, angle, colour = 1e-9, 0, 0
+    for i in range(len(energy)):
+        for c in range(3):
+            albedo = 0.0
+            for n in range(cells):
+                albedo += energy[i, n] * max(raised[c, n] - FLOOR, 0.0)
+            if albedo > whole:
+                whole, angle, colour = albedo, i, c
+    mended[1] = math.log(whole)
+    if sloped and len(energy):
+        for n in range(cells):
+            by = energy[angle, n] * raised[colour, n] / whole
+            if by != 0.0:
+                for k in range(len(z)):
+                    steep[1, k] += by * rows[colour, source[colour, n], k]
     if whole > 1.0:  # no more light than there was
-        fall = np.empty(len(z))
-        for k in range(len(z)):
-            fall[k] = slopes[0, brightest, k] / whole
         for i in range(count):
             for c in range(3):
                 for k in range(len(z)):
-                    slopes[i, c, k] = (slopes[i, c, k] - value[i, c] * fall[k]) / whole
+                    slopes[i, c, k] = (slopes[i, c, k] - value[i, c] * steep[1, k]) / whole
                 value[i, c] /= whole
-    return value, slopes, hole, inward
+    return value, slopes, mended, steep
 
 
 @numba.njit(cache=True, nogil=True)
-def _hole(columns: Any, raised: Any, rows: Any, sloped: Any) -> Any:
+def _hole(columns: Any, outer: Any, raised: Any, rows: Any, sloped: Any) -> Any:
     """By how much (log f) the middle of the profile is darker than its brightest, and the slope
     (k,)."""
-    light = np.zeros(len(columns))
-    top = 0
-    for i in range(len(columns)):
-        for n in columns[i]:
-            for c in range(3):
-                light[i] += LUMINANCE[c] * raised[c, n]
-        if light[i] > light[top]:
-            top = i
+    middle = most = _light_of(columns[0], raised)
+    brightest = columns[0]
+    for nodes in (columns, outer):
+        for i in range(len(nodes)):
+            light = _light_of(nodes[i], raised)
+            if light > most:
+                most, brightest = light, nodes[i]
     inward = np.zeros(rows.shape[2])
     if sloped:
-        for i, sign in ((top, 1.0), (0, -1.0)):
-            for n in columns[i]:
+        for at, by in ((brightest, 1.0 / most), (columns[0], -1.0 / middle)):
+            for n in at:
                 for c in range(3):
-                    by = sign * LUMINANCE[c] * raised[c, n] / light[i]
                     for k in range(len(inward)):
-                        inward[k] += by * rows[c, n, k]
-    return math.log(light[top] / light[0]), inward
+                        inward[k] += by * LUMINANCE[c] * raised[c, n] * rows[c, n, k]
+    return math.log(most / middle), inward
 
 
 @numba.njit(cache=True, nogil=True)
-def _mend(columns: Any, share: Any, core: Any, log: Any, raised: Any) -> Any:
-    """Fills the valleys of columns, as `profiles.Profiles` does with all their nodes: changes
-    `raised` (3, cells); the cell of which each has its value, how much of a trend comes on top, and
-    between which cells that is."""
-    shape = log.shape
-    source, extra = np.empty(shape, np.int64), np.zeros(shape)
-    first, last = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    for c in range(shape[0]):
-        for n in range(shape[1]):
-            source[c, n] = n
-        for j in range(columns.shape[1]):
-            end, top = columns[len(columns) - 1, j], columns[0, j]
-            for i in range(1, core):
-                if log[c, columns[i, j]] > log[c, top]:
-                    top = columns[i, j]
-            trend = max(log[c, end] - log[c, top], 0.0)
-            best, at = -math.inf, 0
-            for i in range(len(columns) - 2, -1, -1):
-                n = columns[i, j]
-                even = log[c, n] - share[i, j] * trend
-                if even > best:
-                    best, at = even, i
-                else:
-                    source[c, n], first[c, n], last[c, n] = columns[at, j], top, end
-                    extra[c, n] = share[i, j] - share[at, j] if trend > 0.0 else 0.0
-                    raised[c, n] = math.exp(min(best + share[i, j] * trend, 30.0))
-    return source, extra, first, last
+def _light_of(cells: Any, raised: Any) -> Any:
+    light = 0.0
+    for n in cells:
+        for c in range(3):
+            light += LUMINANCE[c] * raised[c, n]
+    return light
 
 
 PALE = 5.0  # C*ab: paler colours have no hue to speak of
@@ -401,7 +388,7 @@ class Ground(NamedTuple):
     Parameters
     ----------
     read : whether scores are read off descriptors; if not, readings and grades are not looked at
-    core, rows, mean, cells, columns, share : as `Readings`
+    rows, mean, cells, columns, outer, energy : as `Readings`
     used : (d,) places of the graded descriptors among all
     at, grade : as `Grades`
     weights, normals : (t, d) and (t, k), raw scores: weights @ grades + normals @ z
@@ -413,12 +400,12 @@ class Ground(NamedTuple):
     """
 
     read: bool
-    core: int
     rows: Float64
     mean: Float64
     cells: Float64
     columns: NDArray[np.int64]
-    share: Float64
+    outer: NDArray[np.int64]
+    energy: Float64
     used: NDArray[np.int64]
     at: Float64
     grade: Float64
@@ -448,52 +435,60 @@ class Ground(NamedTuple):
         density: Density | None,
     ) -> Ground:
         k = len(low)
-        none = np.zeros((0, 0))
+        none, no_cells = np.zeros((0, 0)), np.zeros((0, 0), np.int64)
         readings, grades = optics or (
-            Readings(np.zeros((3, 0, k)), np.zeros(0), none, np.zeros((0, 0), np.int64), none, 0),
+            Readings(np.zeros((3, 0, k)), np.zeros(0), none, no_cells, no_cells, none),
             Grades((), none, none),
         )
         where = density or Density(np.zeros((0, k)), np.zeros((0, k, k)), np.zeros(0), np.zeros(0))
         some = [
-            *readings[:-1], _places(grades.names), grades.at,
+            *readings, _places(grades.names), grades.at,
             grades.grade, weights, normals, zero, span, stiffness, low, high, where.means,
             where.whiten, where.logs, np.zeros((0, len(span))),
         ]  # fmt: skip
         # of one layout: each other one would be compiled anew
         found: list[Any] = [np.array(array, order="C") for array in some]
-        ground = cls(optics is not None, int(readings.core), *found)
+        ground = cls(optics is not None, *found)
         families = [np.clip(mean, low, high) for mean in where.means[:-1]]
         if not families:
             return ground
         return ground._replace(kinds=np.array([ground.look(z)[0] for z in families]))
 
-    def look(self, z: Float64) -> tuple[Float64, Float64, float]:
-        """Scores (t,) at z (k,), readings (1, readings, 3) and how dark the middle of the highlight
-        is; zeros where none are read."""
-        found = _look(self, np.ascontiguousarray(z, np.float64))
-        return found[0], found[1], float(found[2])
+    def look(self, z: Float64) -> tuple[Float64, Float64, Float64]:
+        """Scores (t,) at z (k,), readings (1, readings, 3) and what decoding mends (2,), as
+        `_near`; zeros where nothing is read."""
+        score, readings, mended = _look(self, np.ascontiguousarray(z, np.float64))
+        return score, readings, mended
 
 
 @numba.njit(cache=True, nogil=True)
 def _read(ground: Any, z: Any, sloped: Any) -> Any:
     return _near(
-        z, ground.rows, ground.mean, ground.cells, ground.columns, ground.share, ground.core, sloped
+        z,
+        ground.rows,
+        ground.mean,
+        ground.cells,
+        ground.columns,
+        ground.outer,
+        ground.energy,
+        sloped,
     )
 
 
 @numba.njit(cache=True, nogil=True)
 def _look(ground: Any, z: Any) -> Any:
-    score, readings, hole = _dots(ground.normals, z), np.zeros((1, len(READINGS), 3)), 0.0
+    score, readings = _dots(ground.normals, z), np.zeros((1, len(READINGS), 3))
+    mended = np.zeros(2)
     if ground.read:
         near = _read(ground, z, False)
-        readings, hole = np.expand_dims(near[0], 0), near[2]
+        readings, mended = np.expand_dims(near[0], 0), near[2]
         grades = _interpolated(formulas(readings), ground.used, ground.at, ground.grade)
         for i in range(len(score)):
             for j in range(grades.shape[1]):
                 score[i] += ground.weights[i, j] * grades[0, j]
     for i in range(len(score)):
         score[i] = (score[i] - ground.zero[i]) / ground.span[i]
-    return score, readings, hole
+    return score, readings, mended
 
 
 @numba.njit(cache=True, nogil=True)
@@ -520,7 +515,7 @@ class Task(NamedTuple):
     hued, hues : whether hues stay, and a* and b* (2, 2) of body and lobe
     strictly_hued : whether no move may turn them
     least : log density, `-inf` if it does not matter
-    hole : the darkest middle of a highlight, in log f
+    mended : (2,) the most that decoding may mend, as `_near`
     back : how much of what had better stay is drawn back to where it was
     strict : whether a stride is given up early
     """
@@ -538,24 +533,22 @@ class Task(NamedTuple):
     hues: Float64
     strictly_hued: bool
     least: float
-    hole: float
+    mended: Float64
     back: float = 1.0
     strict: bool = True
 
     def relaxed(self) -> list[Task]:
         """This task with what it keeps held, drawn back, and left to itself."""
-        free = [self._replace(back=0.0, strict=False)]
-        if self.hued and not self.strictly_hued:
-            free.append(free[0]._replace(hued=False))
+        free = self._replace(back=0.0, strict=False)
         if not len(self.kept):
-            return [self, *free]
+            return [self, free]
         held = self._replace(
             body=np.vstack([self.body, self.kept]),
             body_at=np.append(self.body_at, self.kept_at),
             kept=self.kept[:0],
             kept_at=self.kept_at[:0],
         )
-        return [held, self, *free]
+        return [held, self, free]
 
 
 def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64, float]:
@@ -569,15 +562,16 @@ def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64,
     relaxed = task.relaxed()
     for more in relaxed:
         at, way = _path(ground, more, at, way, end)
+    anew = relaxed[-1]._replace(strictly_hued=task.hued)  # of those kinds all but the colour
     for share in _NUDGES:
         if way >= end:
             break
         for kind in _kinds(ground, task, at):
             goal = min(0.5 * STRIDE * (math.floor(2.0 * way / STRIDE + 1e-9) + 1.0), end)
             nearer = np.clip(at + share * (kind - at), ground.low, ground.high)
-            fits, found = _towards(ground, relaxed[-1], nearer, goal, goal == end)
+            fits, found = _towards(ground, anew, nearer, goal, goal == end)
             if fits:
-                at, way = _path(ground, relaxed[-1], found, goal, end)
+                at, way = _path(ground, anew, found, goal, end)
                 break
     return at, float(way)
 
@@ -615,7 +609,7 @@ def _linear(ground: Ground, task: Task, z: Float64, way: float) -> tuple[Float64
     missing = _missing(task, z, way, score, readings)[0]
     slopes, hues, stiff, _ = _around(ground, task, z)
     rows, _ = _rows(task, z, score, readings, slopes, hues)
-    return missing[:-2], rows[:-2], stiff
+    return missing[:-3], rows[:-3], stiff
 
 
 def _path(ground: Ground, task: Task, at: Float64, way: float, end: float) -> tuple[Float64, float]:
@@ -644,21 +638,23 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
     """
     z = start.copy()
     before, first = math.inf, math.inf
-    sloped = thinned = pitted = False
+    sloped = thinned = False
+    at_wall = np.zeros(2, np.bool_)
     from_here, step, uphill = z.copy(), np.zeros(len(z)), np.zeros(len(z))
-    slopes, hues, stiff, inward = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), uphill
+    none = np.zeros((0, 0))
+    slopes, hues, stiff, steep = none, none, none, none
     for turn in range(_TURNS):
-        score, readings, pit = _look(ground, z)
+        score, readings, mended = _look(ground, z)
         missing, miss, off = _missing(task, z, way, score, readings)
         thin = 0.0
         if task.least > -math.inf:
             found, uphill = _log_density(z, ground.means, ground.whiten, ground.logs)
             thin = task.least - found
-        hole = pit - task.hole
+        broken = max(mended[0] - task.mended[0], mended[1] - task.mended[1])
         enough = _EXACT if last and turn < _TURNS - 3 else _NEAR
-        if miss <= enough and thin <= 1e-3 and hole <= 0.03 and off <= _TURN and turn > 0:
+        if miss <= enough and thin <= 1e-3 and broken <= 0.03 and off <= _TURN and turn > 0:
             return True, z
-        merit = miss + max(hole, 0.0) + 0.1 * max(thin, 0.0)
+        merit = miss + max(broken, 0.0) + 0.1 * max(thin, 0.0)
         if turn == 5 and merit > 0.5 * first:
             return False, z  # it leads nowhere
         first = merit if turn == 0 else first
@@ -669,7 +665,7 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
         else:
             # slopes are kept as long as they lead there
             if not sloped or merit > 0.3 * before:
-                slopes, hues, stiff, inward = _around(ground, task, z)
+                slopes, hues, stiff, steep = _around(ground, task, z)
                 sloped = True
             before = merit
             rows, pull = _rows(task, z, score, readings, slopes, hues)
@@ -677,13 +673,15 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
                 pull[:] = 0.0
             count = len(task.fixed) + len(task.body)
             # what a step has run into stays a wall in those that follow
-            thinned, pitted = thinned or thin > 0.0, pitted or hole > 0.0
+            thinned = thinned or thin > 0.0
             if thinned:
                 missing[count], rows[count] = thin, uphill
                 count += 1
-            if pitted:
-                missing[count], rows[count] = -hole, inward
-                count += 1
+            for i in range(2):
+                at_wall[i] |= mended[i] > task.mended[i]
+                if at_wall[i]:
+                    missing[count], rows[count] = task.mended[i] - mended[i], steep[i]
+                    count += 1
             fits, step = _step(
                 stiff, rows[:count], missing[:count], ground.low, ground.high, z, pull
             )
@@ -699,12 +697,12 @@ def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
 @numba.njit(cache=True, nogil=True)
 def _around(ground: Any, task: Any, z: Any) -> Any:
     """At z (k,): gradients of scores (t, k) and of hues (4, k), the stiffness (k, k) of what had
-    better stay, and the gradient of the hole (k,)."""
+    better stay, and the gradients of what decoding mends (2, k)."""
     k, t = len(z), len(ground.normals)
     slopes = ground.normals.copy()
-    steps, inward = np.zeros((k + 1, len(READINGS), 3)), np.zeros(k)
+    steps, steep = np.zeros((k + 1, len(READINGS), 3)), np.zeros((2, k))
     if ground.read:
-        readings, by_z, _, inward = _read(ground, z, True)
+        readings, by_z, _, steep = _read(ground, z, True)
         for i in range(len(readings)):
             for c in range(3):
                 # formulas of a few numbers: cheaper once more than their slopes
@@ -735,7 +733,7 @@ def _around(ground: Any, task: Any, z: Any) -> Any:
         _stiffen(stiff, task.kept[i], _BODY)
     for i in range(len(hues)):
         _stiffen(stiff, hues[i], _HUE)
-    return slopes, hues, stiff, inward
+    return slopes, hues, stiff, steep
 
 
 @numba.njit(cache=True, nogil=True)
@@ -748,10 +746,10 @@ def _stiffen(stiff: Any, row: Any, by: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _missing(task: Any, z: Any, way: Any, score: Any, readings: Any) -> Any:
-    """What is missing (m + 2,) of what is fixed, the most of it, and by how many degrees hues are
-    off; the last two are left for walls."""
+    """What is missing (m + 3,) of what is fixed, the most of it, and by how many degrees hues are
+    off; the last three are left for walls."""
     count, most, off = len(task.fixed), 0.0, 0.0
-    missing = np.zeros(count + len(task.body) + 2)
+    missing = np.zeros(count + len(task.body) + 3)
     for i in range(count):
         missing[i] = task.start[i] + task.rates[i] * way - score[task.fixed[i]]
     body = _dots(task.body, z)
@@ -767,9 +765,9 @@ def _missing(task: Any, z: Any, way: Any, score: Any, readings: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _rows(task: Any, z: Any, score: Any, readings: Any, slopes: Any, hues: Any) -> Any:
-    """The rows (m + 2, k) of what is fixed, and the pull (k,) of what had better stay."""
+    """The rows (m + 3, k) of what is fixed, and the pull (k,) of what had better stay."""
     count, k = len(task.fixed), len(z)
-    rows, pull = np.zeros((count + len(task.body) + 2, k)), np.zeros(k)
+    rows, pull = np.zeros((count + len(task.body) + 3, k)), np.zeros(k)
     for i in range(count):
         rows[i] = slopes[task.fixed[i]]
     for i in range(len(task.body)):

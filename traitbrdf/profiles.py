@@ -37,11 +37,9 @@ Int32 = NDArray[np.int32]
 HIGHLIGHT = math.radians(30.0)
 """theta_h up to which a profile has no valley."""
 
-CORE = math.radians(10.0)
-"""theta_h of the brightest of which a profile's trend is counted."""
-
 _TALL = math.radians(80.0)
 _TREND = math.radians(50.0)
+_CORE = math.radians(10.0)
 _RISES = 0.1
 """Trends below this (in log f) do not say what shares of a trend the library has."""
 
@@ -85,7 +83,7 @@ class Profiles:
             np.zeros_like(share),
             np.where(tall, inner, 0).astype(np.int32),
             last.astype(np.int32),
-            int(np.sum(grid.theta_h <= CORE)),
+            int(np.sum(grid.theta_h <= _CORE)),
         )
 
     @classmethod

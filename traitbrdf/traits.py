@@ -529,12 +529,13 @@ class TraitSpace:
             least = min(limit, self.density.log(inside))
         coloured = any(self.names[i] in COLOURFUL for i in moved)
         strictly = "colour" in hold or "color" in hold
-        score, readings, pit = self._ground.look(inside)
-        hole = max(_HOLE, pit) if photoreal and self.optics is not None else math.inf
+        score, readings, mended = self._ground.look(inside)
+        free = not photoreal or self.optics is None
+        mends = np.full(2, math.inf) if free else np.maximum(mended, [_HOLE, 0.0])
         hued = self.optics is not None and (strictly or not coloured)
         return Task(
             fixed, rates, score[fixed], soft, score[soft], body, body @ inside, kept,
-            kept @ inside, hued, colours(readings), strictly, least, hole,
+            kept @ inside, hued, colours(readings), strictly, least, mends,
         )  # fmt: skip
 
     def _said(
@@ -613,9 +614,7 @@ class TraitSpace:
             ),
         }
         if self.optics is not None:
-            state |= {
-                f"reading_{k}": np.array(v) for k, v in self.optics.readings._asdict().items()
-            }
+            state |= {f"reading_{k}": v for k, v in self.optics.readings._asdict().items()}
             state |= {f"grade_{k}": np.array(v) for k, v in self.optics.grades._asdict().items()}
         if self.density is not None:
             state |= {f"density_{k}": v for k, v in self.density._asdict().items()}
@@ -631,10 +630,9 @@ class TraitSpace:
 
         optics = density = None
         if "reading_rows" in state:
-            cells = [name for name in Readings._fields if name != "core"]
             grade_names = tuple(str(name) for name in state["grade_names"])
             optics = Optics(
-                Readings(*(*group("reading", cells), int(state["reading_core"]))),
+                Readings(*group("reading", Readings._fields)),
                 Grades(grade_names, *group("grade", ("at", "grade"))),
             )
         if "density_means" in state:
