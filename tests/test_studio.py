@@ -48,7 +48,7 @@ def session(prepared, training, tmp_path, monkeypatch):
     monkeypatch.setattr(editing, "_training", lambda library, seed: training)
     edit = EditSession(prepared.scene, quality="preview", cache=False)
     again = Transport.restored(prepared.scene, prepared.grid, prepared.arrays())
-    edit._view.prepared = editing._Prepared(again, False, {})
+    edit._view.prepared = editing._Prepared(again, False, {}, again)
     session = Session(edit, tmp_path)
     yield session
     session.close()
