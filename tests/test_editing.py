@@ -1958,7 +1958,7 @@ def test_a_graphics_card_shows_the_same(prepared_ball):
         known = Transport.restored(
             prepared_ball.scene, EMBEDDING.grid_, prepared_ball.arrays(), device
         )
-        session._view.prepared = editing._Prepared(known, False, {})
+        session._view.prepared = editing._Prepared(known, False, {}, known)
         session.assign("sphere", "gold-satin")
         session.render()
         session.assign("sphere", PerfectMirror(0.3) + Lambert(0.4))
