@@ -567,7 +567,7 @@ def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64,
         if way >= end:
             break
         for kind in _kinds(ground, task, at):
-            goal = min(0.5 * STRIDE * (math.floor(2.0 * way / STRIDE + 1e-9) + 1.0), end)
+            goal = _next_mark(way, 0.5 * STRIDE, end)
             nearer = np.clip(at + share * (kind - at), ground.low, ground.high)
             fits, found = _towards(ground, anew, nearer, goal, goal == end)
             if fits:
@@ -616,8 +616,7 @@ def _path(ground: Ground, task: Task, at: Float64, way: float, end: float) -> tu
     """`follow` of one task alone, from where scores have changed by `way` of the rates."""
     stride, least = (STRIDE, 0.2 * STRIDE) if task.strict else (0.5 * STRIDE, 0.05 * STRIDE)
     while way < end and stride > least:
-        # strides end at marks, so that moves by more and by less share their way
-        goal = min(stride * (math.floor(way / stride + 1e-9) + 1.0), end)
+        goal = _next_mark(way, stride, end)
         fits, z = _towards(ground, task, at, goal, goal == end)
         if fits:
             at, way, stride = z, goal, min(2.0 * stride, STRIDE)
@@ -627,6 +626,11 @@ def _path(ground: Ground, task: Task, at: Float64, way: float, end: float) -> tu
         fits, z = _towards(ground, task, at, way, True)
         at = z if fits else at
     return at, way
+
+
+def _next_mark(way: float, stride: float, end: float) -> float:
+    """Where a stride ends: at marks, so that moves by more and by less share their way."""
+    return min(stride * (math.floor(way / stride + 1e-9) + 1.0), end)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -108,20 +108,16 @@ def keep(
     size = np.array([0 if part is None else len(part.pixels) for part in transport.parts])
     whole = (size @ deviation) / np.maximum(size @ level, 1e-30)
     needed, errors = (np.percentile(v, 100.0 * CASES, axis=1) for v in (worst, whole))
-    chosen, kept = len(ranks) - 1, True
-    seconds: float | None = None
-    if error is not None:
-        good = np.flatnonzero(needed <= error)
-        chosen, kept = (int(good[0]), True) if len(good) else (chosen, False)
-    elif fps is not None:
-        chosen, kept = len(ranks), False
-        while chosen > 0 and not kept:
-            chosen -= 1
-            seconds = _median_seconds(frame, transport.truncated(ranks[chosen]))
-            kept = seconds <= RESERVE / fps
-    if seconds is None:
-        seconds = _median_seconds(frame, transport.truncated(ranks[chosen]))
-    used = transport if ranks[chosen] == most else transport.truncated(ranks[chosen])
+    # the fewest images first where an error is asked for, else the most that are fast enough
+    good = np.flatnonzero(needed <= error) if error is not None else np.arange(0)
+    chosen = int(good[0]) if len(good) else len(ranks) - 1
+    while True:
+        used = transport if ranks[chosen] == most else transport.truncated(ranks[chosen])
+        seconds = _median_seconds(frame, used)
+        if fps is None or seconds <= RESERVE / fps or chosen == 0:
+            break
+        chosen -= 1
+    kept = (error is None or len(good) > 0) and (fps is None or seconds <= RESERVE / fps)
     promise = Promise(
         quality, error, fps, ranks[chosen], most, float(errors[chosen]), tables.shape[2], seconds,
         kept,

@@ -477,10 +477,11 @@ class TraitSpace:
             raise ValueError(f"hold: {clash[0]!r} cannot be moved and held at once")
         if all(value == 0.0 for value in moved.values()):
             return self._said(start, start.copy(), moved, held, "")
-        task = self._task(start, moved, held, hold, photoreal)
+        inside = np.clip(start, self.low, self.high)
+        seen = self._ground.look(inside)
+        task = self._task(inside, seen, moved, held, hold, photoreal)
         whole = max(abs(value) for value in moved.values())
-        room = self._room(np.clip(start, self.low, self.high), moved) if photoreal else whole
-        end = min(whole, room)
+        end = min(whole, self._room(seen[0], moved)) if photoreal else whole
         at, way = follow(self._ground, task, start, end)
         stopped, many = "", len(moved) > 1 or bool(hold)
         if way < whole:
@@ -493,10 +494,9 @@ class TraitSpace:
                 at = compromise(self._ground, task, at, min(STRIDE, whole))
         return self._said(start, at, moved, held, stopped)
 
-    def _room(self, z: Float64, moved: Mapping[int, float]) -> float:
-        """How far a move may go until a score leaves what the library has."""
-        whole = max(abs(value) for value in moved.values())
-        score, room = self._ground.look(z)[0], math.inf
+    def _room(self, score: Float64, moved: Mapping[int, float]) -> float:
+        """How far a move may go until a score (t,) leaves what the library has."""
+        whole, room = max(abs(value) for value in moved.values()), math.inf
         for i, value in moved.items():
             rate = value / whole
             if abs(rate) > 1e-9:
@@ -506,19 +506,20 @@ class TraitSpace:
 
     def _task(
         self,
-        start: Float64,
+        inside: Float64,
+        seen: tuple[Float64, Float64, Float64],
         moved: Mapping[int, float],
         held: list[int],
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> Task:
+        """The move from a point of the box of which `Ground.look` has `seen`."""
         whole = max(abs(value) for value in moved.values())
         fixed = np.array([*moved, *held], np.int64)
         rates = np.array([*(value / whole for value in moved.values()), *([0.0] * len(held))])
         known = np.abs(self.related[list(moved)])
         apart = np.flatnonzero((known < RELATED).all(axis=0))
         soft = np.setdiff1d(apart, fixed)
-        inside = np.clip(start, self.low, self.high)
         body = self.body if "body" in hold else self.body[:0]
         keeps = "body" not in hold and any(self.names[i] in KEEPS_BODY for i in moved)
         kept = self.body if keeps else self.body[:0]
@@ -529,7 +530,7 @@ class TraitSpace:
             least = min(limit, self.density.log(inside))
         coloured = any(self.names[i] in COLOURFUL for i in moved)
         strictly = "colour" in hold or "color" in hold
-        score, readings, mended = self._ground.look(inside)
+        score, readings, mended = seen
         free = not photoreal or self.optics is None
         mends = np.full(2, math.inf) if free else np.maximum(mended, [_HOLE, 0.0])
         hued = self.optics is not None and (strictly or not coloured)
