@@ -67,6 +67,10 @@ _UNEVEN = 0.005
 """Most that a cell's corners differ in what light they see: see `_disagreement`."""
 _QUESTIONS = 192
 """Most rays of its own that a sample casts at occluders' outlines."""
+_CORE = 3e-3
+"""theta_h in radians: leaves at a mirror peak are as small as peaks of twice that width need."""
+_SHARPEST = 1e-4
+"""The same for the narrowest peaks that a table holds."""
 _ALL = (-1.0, 9.0)
 _SHARED = ((4, 0.002), (2, 0.007))
 """Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
@@ -173,7 +177,7 @@ class Operator:
         """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES, core=_SHARPEST)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -194,7 +198,7 @@ class Operator:
             place[at[mine] - span.start] = mine
             everything = np.arange(span.start, span.stop)
             masks = self._plan(part).mask_rows
-            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
+            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place, core=_SHARPEST)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -203,7 +207,8 @@ class Operator:
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, tables)
+        core = _core(self.grid, tables)
+        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=core)
         self._add_lights(out, at, tables)
         return out
 
@@ -243,13 +248,14 @@ class Operator:
         # narrower lobes are interpolated where neighbouring pixels differ less
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
         low, high = (float(self.grid.theta_h[node]) for node in nodes)
-        lobe = _lobe(self.grid, tables, plan.grazing)
+        lobe, core = _lobe(self.grid, tables, plan.grazing), _core(self.grid, tables)
         broad = lobe >= high  # nothing is near
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             self._shade(
                 out, index, plan.mask_rows, _ALL, tables,
                 lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
+                core=core,
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
@@ -266,7 +272,7 @@ class Operator:
         if not broad:
             self._shade(
                 out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
-                lambda fraction: report("near images", fraction), lobe=lobe,
+                lambda fraction: report("near images", fraction), lobe=lobe, core=core,
             )  # fmt: skip
         self._add_lights(out, index, tables)
         return out
@@ -332,15 +338,20 @@ class Operator:
             _first_rows(group_start, mask_rows[target]), several,
         )  # fmt: skip
 
-    def _light(self, window: tuple[float, float], exact: bool, lobe: float) -> tuple[Any, ...]:
+    def _light(
+        self, window: tuple[float, float], exact: bool, lobe: float, core: float
+    ) -> tuple[Any, ...]:
         """What the walk needs beside the samples: nodes, masks and rules."""
         low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
         cut, masks = _NO_CUT, _NO_MASKS
         if self._visibility is not None:
             cut = (self._visibility.cut.first, self._visibility.cut.last)
             masks = self._visibility.masks
+        rules = np.concatenate(
+            [self._exact_rules if exact else self._rules, np.full((2, 1), core, np.float32)], axis=1
+        )
         return (
-            *self._nodes, self._image, *cut, *masks, self._exact_rules if exact else self._rules,
+            *self._nodes, self._image, *cut, *masks, rules,
             f32(low), f32(high if high < 1.0 else 9.0),
             f32(math.sin(_OUTLINE) if lobe <= _SPLIT[1] else -9.0), f32(math.sin(lobe)),
         )  # fmt: skip
@@ -356,16 +367,18 @@ class Operator:
         place: Int64 | None = None,
         exact: bool = False,
         lobe: float = 0.0,
+        core: float = _CORE,
     ) -> None:
         """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
         `tables` (cells, T), or to their rows if there are no tables.
 
         `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
         `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
-        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need.
+        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, `core` none
+        at the peak that are wider than a peak of that width can bear.
         """
         step = 1 << 13
-        light = self._light(window, exact or self.resolution > 1.0, lobe)
+        light = self._light(window, exact or self.resolution > 1.0, lobe, core)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
@@ -966,6 +979,21 @@ def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
     return float(grid.theta_h[max(steps[0] - 1, 0)]) if len(steps) else 0.5 * math.pi
 
 
+def _core(grid: HalfDiffGrid, tables: Float32) -> float:
+    """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
+
+    Peaks are looked for where they are a notable share of their table's; `_CORE` at most.
+    """
+    nodes = int(np.searchsorted(grid.theta_h, 2.0 * _CORE)) + 1
+    values = tables.reshape(grid.shape[0], -1, tables.shape[1])[:nodes]
+    peak = values[0]
+    high = peak > 0.01 * peak.max(axis=0)
+    low = np.flatnonzero(((values < 0.5 * peak) & high).any(axis=(1, 2)))
+    if not len(low):
+        return _CORE
+    return float(np.clip(0.5 * grid.theta_h[low[0]], _SHARPEST, _CORE))
+
+
 _NO_TABLES = np.zeros((1, 0), np.float32)
 _UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
 
@@ -1184,13 +1212,13 @@ def _walk(
     into `ask` and the light let through if `answers` says so (1).
 
     A node is a leaf where its reach in half-vector space is at most `relative` times its distance
-    from the mirror peak (or times `lobe`, where that is more), it carries at most the share
+    from the mirror peak (or times `lobe`, where that is more) and `core`, it carries at most the share
     `brightest` of the irradiance or is accordingly smaller, it is no wider than `widest`, and, if
     the horizon cuts it, `horizon`. `low` and `high` bound sin(theta_h). All holds for half vectors
     up to `spread` away from those of `n` and `v`. Returns the number of leaves, the capacity if too
     many, and of questions.
     """
-    relative, brightest, horizon, widest = rule[0], rule[1], rule[2], rule[3]
+    relative, brightest, horizon, widest, core = rule[0], rule[1], rule[2], rule[3], rule[4]
     t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
     row_sin = row_cos = column_sin = column_cos = f32(0.0)
     total = _coarse_irradiance(n, place, moment, child, stack)
@@ -1285,7 +1313,7 @@ def _walk(
                 + n1 * (moment[i, 1] + moment[i, 4] + moment[i, 7])
                 + n2 * (moment[i, 2] + moment[i, 5] + moment[i, 8])
             )
-        allowed = relative * (max(sin_h - reach - spread, lobe) + f32(3e-3))
+        allowed = relative * (max(sin_h - reach - spread, lobe) + core)
         share = flux / total
         if share > brightest:
             allowed *= max(f32(0.25), f32(math.sqrt(brightest / share)))
