@@ -313,7 +313,8 @@ def test_turning_everything_changes_nothing(ground):
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_how_fragments_are_grouped_does_not_show(make):
     scene = make()
-    operator = Operator(scene, GRID)
+    core = quadrature._core(GRID, channels(TABLES))
+    operator = Operator(scene, GRID, core=core)
     index = some(scene, 40)
     shuffled = np.random.default_rng(2).permutation(len(index))
     whole = by_images(operator, index, TABLES)
@@ -321,7 +322,7 @@ def test_how_fragments_are_grouped_does_not_show(make):
     np.testing.assert_allclose(
         by_images(operator, index[shuffled], TABLES), whole[shuffled], rtol=1e-5, atol=1e-6 * level
     )
-    anew = Operator(scene, GRID)
+    anew = Operator(scene, GRID, core=core)
     parts = [by_images(anew, few, TABLES) for few in np.split(index, [1, 8, 31])]
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-5, atol=1e-6 * level)
     np.testing.assert_allclose(by_rows(anew, index, TABLES), whole, rtol=1e-3, atol=1e-5 * level)
@@ -361,7 +362,7 @@ def test_images_of_whole_parts(shadows):
 def test_rows_as_shown_are_those_of_the_images(make):
     """With the same shadows and walks, whatever is asked for beside: a basis is fitted to them."""
     scene = make()
-    operator = Operator(scene, GRID)
+    operator = Operator(scene, GRID, core=quadrature._core(GRID, channels(TABLES)))
     index = some(scene, 60)
     rows = operator.rows_as_shown(index)
     found = np.einsum("mck,kt->mct", rows, channels(TABLES), optimize=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -284,19 +284,30 @@ class EnvironmentMap:
         texels that the horizon does not cut.
         """
         n = self.to_map(np.asarray(normals, np.float64))
-        moment = texel_moments(self).reshape(-1, 3)
-        energy = self.image.reshape(-1, 3).astype(np.float64)
         flat = n.reshape(-1, 3)
-        result = np.empty(flat.shape)
-        for i in range(0, len(flat), 64):
-            result[i : i + 64] = np.maximum(flat[i : i + 64] @ moment.T, 0.0) @ energy
+        result = np.zeros(flat.shape)
+        for rows in self._bands():
+            moment = texel_moments(self, rows).reshape(-1, 3)
+            energy = self.image[rows].reshape(-1, 3).astype(np.float64)
+            for i in range(0, len(flat), 64):
+                result[i : i + 64] += np.maximum(flat[i : i + 64] @ moment.T, 0.0) @ energy
         return result.reshape(n.shape)
 
+    def _bands(self, multiple: int = 1) -> Iterator[slice]:
+        """Rows, some hundred thousand texels at a time: a map may be larger than float64 bears."""
+        m, n, _ = self.image.shape
+        step = multiple * max((1 << 18) // (n * multiple), 1)
+        for start in range(0, m, step):
+            yield slice(start, min(start + step, m))
 
-def texel_moments(environment: EnvironmentMap) -> Float64:
-    """(M, N, 3) integral of the direction over each texel: its solid angle times its centroid."""
-    m, n, _ = environment.image.shape
-    t0, t1 = environment.row_edges[:-1], environment.row_edges[1:]
+
+def texel_moments(environment: EnvironmentMap, rows: slice = slice(None)) -> Float64:
+    """(M, N, 3) integral of the direction over each texel: its solid angle times its centroid.
+
+    Of the map's `rows` alone if they are given.
+    """
+    n = environment.image.shape[1]
+    t0, t1 = environment.row_edges[:-1][rows], environment.row_edges[1:][rows]
     f0 = 2.0 * math.pi * np.arange(n) / n
     f1 = 2.0 * math.pi * (np.arange(n) + 1) / n
     # integrals of sin^2 and of sin cos over a row, and of -sin and cos over a column
@@ -305,7 +316,7 @@ def texel_moments(environment: EnvironmentMap) -> Float64:
     half = 0.5 * (f1 - f0)
     x = -2.0 * np.sin(0.5 * (f0 + f1)) * np.sin(half)
     z = 2.0 * np.cos(0.5 * (f0 + f1)) * np.sin(half)
-    moments = np.empty((m, n, 3))
+    moments = np.empty((len(t0), n, 3))
     moments[..., 0] = across[:, None] * x
     moments[..., 1] = (up * (2.0 * math.pi / n))[:, None]
     moments[..., 2] = across[:, None] * z
@@ -373,6 +384,12 @@ def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
     return _bilinear(image, x, y, wrap=False)
 
 
+_ROWS = 1024
+"""Rows of leaves of a light tree, if there are texels enough: a node takes some 300 bytes."""
+_BLOCK = 16
+"""Most texels along the side of a leaf."""
+
+
 @dataclass(frozen=True)
 class LightTree:
     """An environment map as a binary tree of lat-long rectangles, the root first.
@@ -380,7 +397,7 @@ class LightTree:
     A node's `moment` is the exact vector irradiance of its light, colour by colour, so that a
     Lambert surface sees no difference between a node and its texels; `direction` and `spread` are
     the mean and the standard deviation of where that light comes from. Rectangles without light
-    are left out.
+    are left out. The leaves are texels; of a map of more than `_ROWS` rows they are blocks of them.
 
     Attributes
     ----------
@@ -390,6 +407,7 @@ class LightTree:
     radius : (n,) float32, half the rectangle's diagonal, radians
     child : (n, 2) int32, indices of the halves; -1 where there is none
     rectangle : (n, 4) int32: first and last + 1 row, first and last + 1 column
+    block : height and width of a leaf in texels; less at the map's last row and column
     """
 
     moment: NDArray[np.float32]
@@ -398,11 +416,12 @@ class LightTree:
     radius: NDArray[np.float32]
     child: NDArray[np.int32]
     rectangle: NDArray[np.int32]
+    block: int = 1
 
     @cached_property
     def packed(self) -> tuple[NDArray[Any], ...]:
         """What a walk reads of a node, by how often: place and size (n, 8), irradiance (n, 12),
-        children (n, 2), -2 where the node is one texel, and rectangle (n, 4)."""
+        children (n, 2), -2 where the node is a leaf, and rectangle (n, 4)."""
         place = np.zeros((len(self.radius), 8), np.float32)
         place[:, :3] = self.direction
         place[:, 3] = self.radius
@@ -410,8 +429,8 @@ class LightTree:
         moment = np.zeros((len(self.radius), 12), np.float32)
         moment[:, :9] = self.moment.reshape(-1, 9)
         box = self.rectangle
-        texel = (box[:, 1] - box[:, 0] == 1) & (box[:, 3] - box[:, 2] == 1)
-        child = np.where(texel[:, None], -2, self.child).astype(np.int32)
+        leaf = (box[:, 1] - box[:, 0] <= self.block) & (box[:, 3] - box[:, 2] <= self.block)
+        child = np.where(leaf[:, None], -2, self.child).astype(np.int32)
         return place, moment, child, box
 
     @cached_property
@@ -422,9 +441,16 @@ class LightTree:
 
     @classmethod
     def build(cls, environment: EnvironmentMap) -> LightTree:
-        """Split the map in halves, across the longer side, down to single texels."""
-        m, n, _ = environment.image.shape
-        edges = environment.row_edges
+        """Split the map in halves, across the longer side, down to the leaves."""
+        rows, columns, _ = environment.image.shape
+        block = 1
+        while rows > _ROWS * block and block < _BLOCK:
+            block *= 2
+        # all of this counts in blocks
+        m, n = -(-rows // block), -(-columns // block)
+        down = np.minimum(block * np.arange(m + 1), rows)
+        across = np.minimum(block * np.arange(n + 1), columns)
+        edges = environment.row_edges[down]
         levels = [np.array([[0, m, 0, n]])]
         children = []
         count = 1
@@ -432,10 +458,10 @@ class LightTree:
             box = levels[-1]
             tall = box[:, 1] - box[:, 0]
             wide = box[:, 3] - box[:, 2]
-            height, width = _extent(box, edges, n)
+            height, width = _extent(box, edges, across)
             by_row = (tall > 1) & ((height >= width) | (wide == 1))
             split = (tall > 1) | (wide > 1)
-            parents, across = box[split], by_row[split]
+            parents, lower = box[split], by_row[split]
             child = np.full((len(box), 2), -1)
             child[split] = count + np.arange(2 * len(parents)).reshape(-1, 2)
             children.append(child)
@@ -444,10 +470,10 @@ class LightTree:
             halves = np.repeat(parents, 2, axis=0)
             row = (parents[:, 0] + parents[:, 1]) // 2
             column = (parents[:, 2] + parents[:, 3]) // 2
-            halves[0::2, 1] = np.where(across, row, parents[:, 1])
-            halves[1::2, 0] = np.where(across, row, parents[:, 0])
-            halves[0::2, 3] = np.where(across, parents[:, 3], column)
-            halves[1::2, 2] = np.where(across, parents[:, 2], column)
+            halves[0::2, 1] = np.where(lower, row, parents[:, 1])
+            halves[1::2, 0] = np.where(lower, row, parents[:, 0])
+            halves[0::2, 3] = np.where(lower, parents[:, 3], column)
+            halves[1::2, 2] = np.where(lower, parents[:, 2], column)
             levels.append(halves)
             count += len(halves)
         box = np.concatenate(levels)
@@ -457,9 +483,10 @@ class LightTree:
         flux = np.zeros(len(box))
         leaf = child[:, 0] < 0
         at = box[leaf, 0], box[leaf, 2]
-        texel = environment.image[at].astype(np.float64)
-        flux[leaf] = texel.sum(-1) * environment.solid_angles[box[leaf, 0]]
-        moment[leaf] = texel[:, :, None] * texel_moments(environment)[at][:, None, :]
+        light, shine = _block_light(environment, block)
+        flux[leaf] = light[at]
+        moment[leaf] = shine[at]
+        del light, shine
         starts = np.concatenate([[0], np.cumsum([len(level) for level in levels])])
         for start, stop in reversed(list(itertools.pairwise(starts))):
             inner = np.flatnonzero(child[start:stop, 0] >= 0) + start
@@ -475,7 +502,8 @@ class LightTree:
         known = lit & (length > 0.0)
         unit = np.where(known[:, None], white / np.where(known, length, 1.0)[:, None], (0, 1, 0))
         child = np.where((child >= 0) & ~lit[child], -1, child)
-        height, width = _extent(box, edges, n)
+        height, width = _extent(box, edges, across)
+        box = np.concatenate([down[box[:, :2]], across[box[:, 2:]]], axis=1)
         return cls(
             moment.astype(np.float32),
             unit.astype(np.float32),
@@ -483,15 +511,38 @@ class LightTree:
             (0.5 * np.hypot(height, width)).astype(np.float32),
             child.astype(np.int32),
             box.astype(np.int32),
+            block,
         )
 
 
-def _extent(box: NDArray[np.int64], edges: Float64, columns: int) -> tuple[Float64, Float64]:
-    """Angular height and greatest width of rectangles (n, 4), radians."""
+def _block_light(environment: EnvironmentMap, block: int) -> tuple[Float64, Float64]:
+    """Light of blocks of texels, radiance times solid angle of all colours together, and their
+    moments (..., 3, 3)."""
+    rows, columns, _ = environment.image.shape
+    m, n = -(-rows // block), -(-columns // block)
+    light, shine = np.empty((m, n)), np.empty((m, n, 3, 3))
+    right = np.arange(0, columns, block)
+    for band in environment._bands(block):
+        texel = environment.image[band].astype(np.float64)
+        energy = texel.sum(axis=-1) * environment.solid_angles[band, None]
+        moment = texel[..., None] * texel_moments(environment, band)[..., None, :]
+        lower = np.arange(0, len(texel), block)
+        here = slice(band.start // block, band.start // block + len(lower))
+        for whole, values in ((light, energy), (shine, moment)):
+            whole[here] = np.add.reduceat(np.add.reduceat(values, lower, axis=0), right, axis=1)
+    return light, shine
+
+
+def _extent(
+    box: NDArray[np.int64], edges: Float64, across: NDArray[np.int64]
+) -> tuple[Float64, Float64]:
+    """Angular height and greatest width of rectangles (n, 4), radians, from the polar angles of
+    their rows and the texels of their columns, of which the last edge counts all."""
     top, bottom = edges[box[:, 0]], edges[box[:, 1]]
     widest = np.where(
         (top <= math.pi / 2) & (bottom >= math.pi / 2),
         1.0,
         np.maximum(np.sin(top), np.sin(bottom)),
     )
-    return bottom - top, widest * (box[:, 3] - box[:, 2]) * (2.0 * math.pi / columns)
+    texels = across[box[:, 3]] - across[box[:, 2]]
+    return bottom - top, widest * texels * (2.0 * math.pi / across[-1])

@@ -67,9 +67,9 @@ _UNEVEN = 0.005
 """Most that a cell's corners differ in what light they see: see `_disagreement`."""
 _QUESTIONS = 192
 """Most rays of its own that a sample casts at occluders' outlines."""
-_CORE = 3e-3
+CORE = 3e-3
 """theta_h in radians: leaves at a mirror peak are as small as peaks of twice that width need."""
-_SHARPEST = 1e-4
+SHARPEST = 1e-4
 """The same for the narrowest peaks that a table holds."""
 _ALL = (-1.0, 9.0)
 _SHARED = ((4, 0.002), (2, 0.007))
@@ -126,6 +126,9 @@ class Operator:
     resolution : float
         1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
     tree : what `light_tree` makes of the scene's map, if it is at hand
+    core : float
+        In radians, half the width in theta_h of the narrowest peak that rows and interpolated
+        images resolve. Exact images resolve what their tables hold.
     """
 
     def __init__(
@@ -134,6 +137,7 @@ class Operator:
         grid: HalfDiffGrid,
         resolution: float = 1.0,
         tree: LightTree | None = None,
+        core: float = CORE,
     ) -> None:
         if grid.layout != "folded":
             raise ValueError(f"grid: expected the 'folded' layout, got {grid.layout!r}")
@@ -142,6 +146,7 @@ class Operator:
         self.scene = scene
         self.grid = grid
         self.resolution = resolution
+        self.core = core
         environment = _divided(scene.environment)
         rows, columns, _ = environment.image.shape
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
@@ -177,7 +182,7 @@ class Operator:
         """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES, core=_SHARPEST)
+        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -198,7 +203,7 @@ class Operator:
             place[at[mine] - span.start] = mine
             everything = np.arange(span.start, span.stop)
             masks = self._plan(part).mask_rows
-            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place, core=_SHARPEST)
+            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -207,8 +212,7 @@ class Operator:
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
-        core = _core(self.grid, tables)
-        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=core)
+        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=self._core_of(tables))
         self._add_lights(out, at, tables)
         return out
 
@@ -223,6 +227,9 @@ class Operator:
         np.add.at(out, owner, seen * share[:, None])
         return out.astype(np.float32)
 
+    def _core_of(self, tables: Float32) -> float:
+        return min(self.core, _core(self.grid, tables))
+
     # -- whole parts ----------------------------------------------------------------------------
 
     def part_images(
@@ -236,7 +243,8 @@ class Operator:
 
         Shadows are interpolated where rays agree, and far images where that is safe, unless
         `interpolate` is False: an order of magnitude faster than `images`. Lobes that are wide
-        for the part have nothing but far images, and no leaves finer than they need.
+        for the part have nothing but far images, and no leaves finer than they need. Peaks narrower
+        than the operator's `core` are resolved only without interpolation.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
@@ -248,14 +256,14 @@ class Operator:
         # narrower lobes are interpolated where neighbouring pixels differ less
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
         low, high = (float(self.grid.theta_h[node]) for node in nodes)
-        lobe, core = _lobe(self.grid, tables, plan.grazing), _core(self.grid, tables)
+        lobe = _lobe(self.grid, tables, plan.grazing)
         broad = lobe >= high  # nothing is near
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             self._shade(
                 out, index, plan.mask_rows, _ALL, tables,
                 lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
-                core=core,
+                core=self._core_of(tables),
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
@@ -272,7 +280,7 @@ class Operator:
         if not broad:
             self._shade(
                 out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
-                lambda fraction: report("near images", fraction), lobe=lobe, core=core,
+                lambda fraction: report("near images", fraction), lobe=lobe,
             )  # fmt: skip
         self._add_lights(out, index, tables)
         return out
@@ -367,18 +375,21 @@ class Operator:
         place: Int64 | None = None,
         exact: bool = False,
         lobe: float = 0.0,
-        core: float = _CORE,
+        core: float | None = None,
     ) -> None:
         """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
         `tables` (cells, T), or to their rows if there are no tables.
 
         `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
         `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
-        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, `core` none
-        at the peak that are wider than a peak of that width can bear.
+        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, and `core`
+        (this operator's if left out) none that are wider at the peak than peaks of twice that width
+        bear.
         """
         step = 1 << 13
-        light = self._light(window, exact or self.resolution > 1.0, lobe, core)
+        light = self._light(
+            window, exact or self.resolution > 1.0, lobe, self.core if core is None else core
+        )
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
@@ -982,16 +993,16 @@ def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
 def _core(grid: HalfDiffGrid, tables: Float32) -> float:
     """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
 
-    Peaks are looked for where they are a notable share of their table's; `_CORE` at most.
+    Peaks are looked for where they are a notable share of their table's; `CORE` at most.
     """
-    nodes = int(np.searchsorted(grid.theta_h, 2.0 * _CORE)) + 1
+    nodes = int(np.searchsorted(grid.theta_h, 2.0 * CORE)) + 1
     values = tables.reshape(grid.shape[0], -1, tables.shape[1])[:nodes]
     peak = values[0]
     high = peak > 0.01 * peak.max(axis=0)
     low = np.flatnonzero(((values < 0.5 * peak) & high).any(axis=(1, 2)))
     if not len(low):
-        return _CORE
-    return float(np.clip(0.5 * grid.theta_h[low[0]], _SHARPEST, _CORE))
+        return CORE
+    return float(np.clip(0.5 * grid.theta_h[low[0]], SHARPEST, CORE))
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
@@ -1155,11 +1166,27 @@ def _interpolate(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
 
 
 @numba.njit(cache=True, inline="always")
+def _push_texels(cells: Any, top: Any, box: Any, t_step: Any, f_step: Any) -> Any:
+    """Put the texels of a leaf on the stack `cells`, as offsets from its middle, each with the row
+    and the column it is of; returns the stack's new top."""
+    row, column = 0.5 * (box[0] + box[1]), 0.5 * (box[2] + box[3])
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            top += 1
+            cells[top, 0], cells[top, 1] = (i - row) * t_step, (i + 1 - row) * t_step
+            cells[top, 2], cells[top, 3] = (j - column) * f_step, (j + 1 - column) * f_step
+            cells[top, 4], cells[top, 5] = i, j
+    return top
+
+
+@numba.njit(cache=True, inline="always")
 def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> Any:
-    """Put the quarters of a piece of a texel on the stack `cells`; returns its new top."""
+    """Put the quarters of the piece above the stack `cells` on it; returns its new top."""
     tm, fm = f32(0.5) * (t0 + t1), f32(0.5) * (f0 + f1)
+    row, column = cells[top + 1, 4], cells[top + 1, 5]
     for a in range(4):
         top += 1
+        cells[top, 4], cells[top, 5] = row, column
         cells[top, 0] = t0 if a < 2 else tm
         cells[top, 1] = tm if a < 2 else t1
         cells[top, 2] = f0 if a % 2 == 0 else fm
@@ -1212,11 +1239,11 @@ def _walk(
     into `ask` and the light let through if `answers` says so (1).
 
     A node is a leaf where its reach in half-vector space is at most `relative` times its distance
-    from the mirror peak (or times `lobe`, where that is more) and `core`, it carries at most the share
-    `brightest` of the irradiance or is accordingly smaller, it is no wider than `widest`, and, if
-    the horizon cuts it, `horizon`. `low` and `high` bound sin(theta_h). All holds for half vectors
-    up to `spread` away from those of `n` and `v`. Returns the number of leaves, the capacity if too
-    many, and of questions.
+    from the mirror peak (or times `lobe`, where that is more) and `core`, it carries at most the
+    share `brightest` of the irradiance or is accordingly smaller, it is no wider than `widest`,
+    and, if the horizon cuts it, `horizon`. `low` and `high` bound sin(theta_h). All holds for half
+    vectors up to `spread` away from those of `n` and `v`. Returns the number of leaves, the
+    capacity if too many, and of questions.
     """
     relative, brightest, horizon, widest, core = rule[0], rule[1], rule[2], rule[3], rule[4]
     t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
@@ -1235,13 +1262,14 @@ def _walk(
     fate = _LIT
     seen = f32(1.0)
     piece = -1
-    texel = 0
+    texel = row = column = 0
     while top >= 0 or piece >= 0:
         in_texel = piece >= 0
         t0 = t1 = f0 = f1 = st = m0 = m1 = m2 = f32(0.0)
         if in_texel:
             i = texel
             t0, t1, f0, f1 = cells[piece, 0], cells[piece, 1], cells[piece, 2], cells[piece, 3]
+            row, column = int(cells[piece, 4]), int(cells[piece, 5])
             piece -= 1
             st, ct = _turned(f32(0.5) * (t0 + t1), row_sin, row_cos)
             sf, cf = _turned(f32(0.5) * (f0 + f1), column_sin, column_cos)
@@ -1302,7 +1330,6 @@ def _walk(
             half, _ = _turned(f32(0.5) * (t1 - t0), f32(0.0), f32(1.0))
             # the mean of its directions is shorter than one by half their variance
             omega = f32(2.0) * st * half * (f1 - f0) * (f32(1.0) - variance)
-            row, column = box[i, 0], box[i, 2]
             m0 = image[row, column, 0] * omega
             m1 = image[row, column, 1] * omega
             m2 = image[row, column, 2] * omega
@@ -1335,11 +1362,17 @@ def _walk(
                     asked += 1
                     fate = _LIT
                 texel = i
-                t, f = (box[i, 0] + 0.5) * t_step, (box[i, 2] + 0.5) * f_step
+                t, f = (
+                    0.5 * (box[i, 0] + box[i, 1]) * t_step,
+                    0.5 * (box[i, 2] + box[i, 3]) * f_step,
+                )
                 row_sin, row_cos = f32(math.sin(t)), f32(math.cos(t))
                 column_sin, column_cos = f32(math.sin(f)), f32(math.cos(f))
-                t, f = f32(0.5 * t_step), f32(0.5 * f_step)
-                piece = _push_quarters(cells, piece, -t, t, -f, f)
+                piece = _push_texels(cells, piece, box[i], t_step, f_step)
+                if box[i, 1] - box[i, 0] == 1 and box[i, 3] - box[i, 2] == 1:
+                    # the texel as a whole has just been found too large
+                    t, f = f32(0.5 * t_step), f32(0.5 * f_step)
+                    piece = _push_quarters(cells, piece - 1, -t, t, -f, f)
                 continue
             else:
                 for s in range(2):
@@ -1576,7 +1609,7 @@ def _shade(
     for u in numba.prange((bundles + block - 1) // block):
         stack = np.empty(512, np.int32)
         fates = np.empty(512, np.int8)
-        cells = np.empty((256, 4), np.float32)
+        cells = np.empty((512, 6), np.float32)
         leaves = np.empty((13, capacity), np.float32)
         cell = np.empty((3, capacity), np.int32)
         part = np.empty((7, capacity), np.float32)

@@ -50,6 +50,7 @@ from traitbrdf.models import (
     Sheen,
     TorranceSparrowSimplified,
 )
+from traitbrdf.quadrature import SHARPEST
 from traitbrdf.quadrature import Operator as Operator
 from traitbrdf.quadrature import Progress as Progress
 from traitbrdf.scene import Scene
@@ -413,10 +414,12 @@ class Transport:
 
     @property
     def _exact(self) -> Operator:
-        """The operator of the probes, at twice the resolution."""
+        """The operator of the probes, at twice the resolution and for the narrowest peaks."""
         if self._probe_operator is None:
             tree = self.operator.tree
-            self._probe_operator = Operator(self.scene, self.grid, 2.0 * self.resolution, tree)
+            self._probe_operator = Operator(
+                self.scene, self.grid, 2.0 * self.resolution, tree, SHARPEST
+            )
         return self._probe_operator
 
     def _compress(
