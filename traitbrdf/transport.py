@@ -60,12 +60,18 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
+_PIECE = 4096
+"""Fragments whose rows of a basis are widened at a time."""
+_TOP = {torch.float32: 1.0, torch.bfloat16: 1.0, torch.float16: 2.0**14}
+"""The types a basis is kept in, and the largest number that its columns are scaled to."""
+
+
 @dataclass
 class _Basis:
     """The compressed operator of a group of parts; C is 3, or 1 where all light is grey."""
 
     parts: range
-    basis: torch.Tensor  # Q (P, r), of all colours
+    basis: torch.Tensor  # Q (P, r), of all colours; of whatever type it is kept in
     damping: torch.Tensor  # (P,) what the fit of a fragment was weighted with
     cells: torch.Tensor  # (n,) the cells of the grid that the group sees
     rows: torch.Tensor  # (C, r + m, n): the projection, and the probes' exact rows below it
@@ -88,6 +94,27 @@ class _Basis:
     def at_cells(self, table: torch.Tensor) -> torch.Tensor:
         """(3, n) of a table (len(Transport.cells), 3)."""
         return (table if self.place is None else table[self.place]).T.contiguous()
+
+    def images(self, fragments: slice, coefficients: torch.Tensor) -> torch.Tensor:
+        """(P, 3) float32: Q of some of its fragments times coefficients (3, r)."""
+        chosen = self.basis[fragments]
+        if chosen.dtype == torch.float32:
+            return chosen @ coefficients.T
+        # sums of half precision would lose what cancels; a piece at a time, as caches hold it
+        pieces = torch.split(chosen, _PIECE)
+        return torch.cat([piece.float() @ coefficients.T for piece in pieces])
+
+    def stored(self, dtype: torch.dtype) -> _Basis:
+        """The same with Q in another type, each column scaled to fill its range; the scales go
+        into the projection."""
+        basis = self.basis.float()
+        if dtype == torch.float32:
+            return replace(self, basis=basis)
+        size = basis.abs().amax(dim=0) if len(basis) else basis.new_ones(self.rank)
+        scale = torch.where(size > 0.0, _TOP[dtype] / size.clamp_min(1e-30), 1.0)
+        rows = self.rows.clone()
+        rows[:, : self.rank] /= scale[:, None]
+        return replace(self, basis=(basis * scale).to(dtype), rows=rows)
 
 
 @dataclass
@@ -273,6 +300,25 @@ class Transport:
         ]
         return other
 
+    def stored(self, dtype: torch.dtype) -> Transport:
+        """This transport with its basis images kept as `dtype`: float32, float16 or bfloat16.
+
+        Half the memory, and errors of rounding that frames measure like all others; sums stay in
+        float32. This one stays as it is.
+
+        Raises
+        ------
+        ValueError
+            If it is another type.
+        """
+        if dtype not in _TOP:
+            raise ValueError(f"dtype: expected float32, float16 or bfloat16, got {dtype}")
+        other = copy.copy(self)
+        other.dtype = dtype
+        other.parts, other._projected = list(self.parts), ()
+        other.bases = [basis.stored(dtype) for basis in self.bases]
+        return other
+
     @property
     def rank_used(self) -> int:
         """The most images of any basis."""
@@ -307,7 +353,7 @@ class Transport:
                     if part is None:
                         continue
                     exact = found[basis.rank :][part.exact]
-                    images = basis.basis[part.span][part.probes[own]]
+                    images = basis.basis[part.span][part.probes[own]].float()
                     level[index] += exact.mean(dim=0) / 3.0
                     for i, rank in enumerate(ranks):
                         shown = (images[:, :rank] @ found[: min(rank, basis.rank)]).clamp_min(0.0)
@@ -395,6 +441,8 @@ class Transport:
         self.device = torch.device(device)
         self.grey = _is_grey(scene)
         """Whether all light is grey, so that one channel of the basis serves all three."""
+        self.dtype = torch.float32
+        """What the basis images are kept in: see `stored`."""
         self.fixed: frozenset[int] = frozenset()
         """Parts that were prepared for one material alone."""
         self.bases: list[_Basis] = []
@@ -612,7 +660,9 @@ class Transport:
             return
         known = self.bases[mine.group]
         damping = known.damping.cpu()
-        basis = known.basis.cpu() * damping[:, None]
+        basis = known.basis.cpu().float() * damping[:, None]
+        if self.dtype != torch.float32:  # its columns were scaled
+            basis /= basis.norm(dim=0).clamp_min(1e-30)
         fresh = torch.zeros((len(basis), 3))
         fresh[mine.span] = radiance.cpu() * damping[mine.span, None]
         basis = _extended(basis, fresh)
@@ -620,7 +670,8 @@ class Transport:
         cells = known.cells.cpu().numpy()
         exact[:, :, cells] = known.probes.cpu().numpy()
         rng = np.random.default_rng(basis.shape[-1])
-        self.bases[mine.group] = self._assemble(known.parts, basis, damping, exact, rng)
+        trained = self._assemble(known.parts, basis, damping, exact, rng)
+        self.bases[mine.group] = trained.stored(self.dtype)
         self._join_cells()
 
     # -- files ----------------------------------------------------------------------------------
@@ -734,7 +785,7 @@ class Transport:
             return torch.zeros((0, 3), device=self.device)
         basis = self.bases[known.group]
         coefficients = _per_colour(basis.projection, basis.at_cells(table))
-        return basis.basis[known.span] @ coefficients.T
+        return basis.images(known.span, coefficients)
 
     def _project(
         self, part: _Part, table: torch.Tensor, alone: bool
@@ -781,7 +832,7 @@ class Transport:
             return PartFrame(empty, 0.0, 0.0)
         basis = self.bases[known.group]
         coefficients, exact = self._project(known, table, alone)
-        pixels = (basis.basis[known.span] @ coefficients.T).clamp_min_(0.0)
+        pixels = basis.images(known.span, coefficients).clamp_min_(0.0)
         found = torch.gather(pixels, 0, known.probes.T.expand(-1, 3)).T
         deviation = float((found - exact).abs().mean())
         level = float(exact.mean())
