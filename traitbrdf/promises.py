@@ -25,7 +25,7 @@ QUALITIES: dict[str, tuple[int, float]] = {
     "preview": (40, 0.7),
     "interactive": (96, 1.0),
     "accurate": (144, 1.5),
-    "reference": (40, 2.0),
+    "reference": (40, 3.0),
 }
 """Basis images and resolution of the light for each quality. "reference" shows nothing by its
 basis: every frame is exact, and takes seconds."""
