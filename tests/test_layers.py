@@ -23,6 +23,7 @@ FLOORS = (
     ("traits",),
     ("editing",),
     ("bench",),
+    ("trade",),
     ("studio",),
     ("cli",),
 )

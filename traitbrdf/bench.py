@@ -184,7 +184,7 @@ def unseen(data: Path | None, quick: bool = False, seed: int = 0) -> dict[str, l
     return {kind: tables for kind, tables in kinds.items() if tables}
 
 
-def _channels(tables: Sequence[TabulatedBRDF]) -> Float32:
+def channels(tables: Sequence[TabulatedBRDF]) -> Float32:
     """(cells, 3 B) of B tables, each colour channel a column."""
     flat = [table.values.reshape(-1, 3).astype(np.float32) for table in tables]
     return np.concatenate(flat, axis=1)
@@ -337,7 +337,7 @@ def _shown(transport: Transport, tables: Sequence[TabulatedBRDF], index: Int64) 
         mine = np.flatnonzero((index >= span.start) & (index < span.stop))
         wrong = np.flatnonzero(refused[part])
         for some in np.array_split(wrong, math.ceil(len(wrong) / 16)) if len(wrong) else []:
-            own = _channels([tables[b] for b in some])
+            own = channels([tables[b] for b in some])
             images = transport.operator.part_images(part, own, interpolate=False)
             exact = own_colours(images[index[mine] - span.start])
             final[mine[:, None], some] = exact
@@ -555,7 +555,7 @@ def shadow_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
             unhidden = free.part_images(ground, grey)[:, 1, 0]
             dark = np.flatnonzero(lit < 0.9 * unhidden)
             index, true, _ = _drawn(oracle, scene, dark + span.start, count, rng)
-            images = operator.part_images(ground, _channels(tables))[index - span.start]
+            images = operator.part_images(ground, channels(tables))[index - span.start]
             errors.append(_errors(own_colours(images), true))
             say(f"  {name:12s} {_spread(errors[-1])}")
     percent = 100.0 * np.stack(errors)
@@ -679,7 +679,7 @@ def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record
     away = np.abs(embedding.decode_values(z, None, cells) - exact)
     yield Record.at_most(
         "decoding the cells of a scene",
-        _milliseconds(lambda: embedding.decode_values(z, None, cells), 5 if quick else 60),
+        milliseconds(lambda: embedding.decode_values(z, None, cells), 5 if quick else 60),
         "ms",
         1.0,
         error=float(away.sum() / exact.sum()),
@@ -689,7 +689,7 @@ def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record
     away = np.abs(embedding.decode(z, fine).regrid(grid).values - full.values) * cosine
     yield Record.at_most(
         "decoding a full table",
-        _milliseconds(lambda: embedding.decode(z, fine), 1 if quick else 9),
+        milliseconds(lambda: embedding.decode(z, fine), 1 if quick else 9),
         "ms",
         100.0,
         error=float(away.sum() / (full.values * cosine).sum()),
@@ -748,7 +748,7 @@ def spheres_compared(
     linear, exposed, error = np.empty((3, len(environments), len(tables)))
     for m, environment in enumerate(environments):
         operator = Operator(Scene(sphere(), environment, size=size), tables[0].grid)
-        images = own_colours(operator.part_images(0, _channels([*tables, *shown])))
+        images = own_colours(operator.part_images(0, channels([*tables, *shown])))
         for i, (true, found) in enumerate(zip(*np.split(images.swapaxes(0, 1), 2), strict=True)):
             linear[m, i] = decibels(float(true.max()), float(np.mean((true - found) ** 2)))
             scale = 0.8 / np.quantile(true.max(axis=1), 0.9)
@@ -1111,7 +1111,7 @@ def _body_and_lobe(grid: HalfDiffGrid, values: NDArray[Any], whole: bool) -> lis
     return [None if dark else math.pi * body, lobe / lobe.max() if stands else None]
 
 
-def _milliseconds(call: Callable[[], object], repeats: int) -> float:
+def milliseconds(call: Callable[[], object], repeats: int) -> float:
     """Median time of a call, after one that does not count."""
     call()
     times = []

@@ -129,6 +129,8 @@ class Operator:
     core : float
         In radians, half the width in theta_h of the narrowest peak that rows and interpolated
         images resolve. Exact images resolve what their tables hold.
+    shadows : float or None
+        The same as `resolution` for the visibility nodes alone; None: as that has it.
     """
 
     def __init__(
@@ -138,11 +140,13 @@ class Operator:
         resolution: float = 1.0,
         tree: LightTree | None = None,
         core: float = CORE,
+        shadows: float | None = None,
     ) -> None:
         if grid.layout != "folded":
             raise ValueError(f"grid: expected the 'folded' layout, got {grid.layout!r}")
-        if not (math.isfinite(resolution) and resolution > 0.0):
-            raise ValueError(f"resolution: expected a positive number, got {resolution!r}")
+        for name, given in (("resolution", resolution), ("core", core), ("shadows", shadows)):
+            if given is not None and not (math.isfinite(given) and given > 0.0):
+                raise ValueError(f"{name}: expected a positive number, got {given!r}")
         self.scene = scene
         self.grid = grid
         self.resolution = resolution
@@ -171,7 +175,8 @@ class Operator:
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
         self._visibility: _Visibility | None = None
         if any(scene.casts):
-            width = min(scale, math.sqrt(scale))  # shadows blur less well than lobes do
+            wide = 1.0 / (resolution if shadows is None else shadows)
+            width = min(wide, math.sqrt(wide))  # shadows blur less well than lobes do
             cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
             self._visibility = _Visibility(scene, cut, self._middle)
         self._plans: dict[int, _Plan] = {}
