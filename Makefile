@@ -15,7 +15,8 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $(STAMP)
 
-# The path tracer that tests/test_peers.py compares with; it needs Debian's libllvm19 as well.
+# The path tracer that tests/test_peers.py and `traitbrdf bench --peers` compare with; it needs
+# Debian's libllvm19 as well.
 peers: venv
 	$(BIN)/python -m pip install --quiet --editable ".[peers]"
 

@@ -22,6 +22,7 @@ FLOORS = (
     ("gallery", "promises"),
     ("traits",),
     ("editing",),
+    ("peers",),
     ("bench",),
     ("trade",),
     ("studio",),

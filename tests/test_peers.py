@@ -19,20 +19,19 @@ Beside noise the two differ by what is called `SYSTEMATIC` below. It is made of
 
 from __future__ import annotations
 
-import functools
 import math
 import os
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from traitbrdf import reference
+from traitbrdf import bench, peers, reference
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
 from traitbrdf.models import GGX, Lambert
+from traitbrdf.peers import fit_lobe, integrator, their_map, their_rays, their_scene, traced
 from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import Mesh, Sphere, sphere, teapot
+from traitbrdf.shapes import Mesh, sphere, teapot
 
 pytestmark = pytest.mark.slow
 
@@ -49,226 +48,24 @@ MODELS = {
 """Models to tabulate, and the roughness by which Mitsuba places its samples."""
 
 
-@functools.cache
-def load_peer():
-    """Mitsuba, Dr.Jit and our table as a material of theirs; or why there are none."""
-    try:
-        import drjit
-        import mitsuba
-
-        mitsuba.set_variant("llvm_ad_rgb")
-        drjit.eval(mitsuba.Float(1.0) + 1.0)  # without the LLVM library this is what fails
-    except (ImportError, RuntimeError) as error:
-        return f"needs Mitsuba 3 and the LLVM library (the extra 'peers'): {error}"
-    return SimpleNamespace(mi=mitsuba, dr=drjit, material=table_material(mitsuba, drjit))
-
-
 @pytest.fixture
 def peer():
     """Skips without Mitsuba, save where CI=true: there the check must not vanish unseen."""
-    found = load_peer()
-    if isinstance(found, str):
+    try:
+        return peers.load()
+    except RuntimeError as error:
         if os.environ.get("CI") == "true":
-            pytest.fail(found)
-        pytest.skip(found)
-    return found
-
-
-def table_material(mi, dr):
-    """A class: a table on a folded grid as a Mitsuba material of two equal sides."""
-
-    class Table(mi.BSDF):
-        def __init__(self, table, alpha):
-            super().__init__(mi.Properties())
-            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            self.m_flags, self.m_components = flags, [flags]
-            self.counts = table.grid.shape
-            self.values = mi.Float(table.values.astype(np.float32).ravel())
-            self.spread = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, False)
-
-        def look_up(self, light, view):
-            """Trilinear in theta_h, theta_d, phi_d (Rusinkiewicz 1998), from the angles anew."""
-            n_h, n_d, n_p = self.counts
-            half = dr.normalize(light + view)
-            slant = dr.hypot(half.x, half.y)
-            theta_h = dr.atan2(slant, half.z)
-            theta_d = dr.atan2(dr.norm(light - view), dr.norm(light + view))
-            c, s = dr.select(slant > 0, half.x / slant, 1), dr.select(slant > 0, half.y / slant, 0)
-            along = half.z * (c * light.x + s * light.y) - slant * light.z
-            phi_d = dr.abs(dr.atan2(c * light.y - s * light.x, along))
-            phi_d = dr.minimum(phi_d, math.pi - phi_d)
-
-            def bracket(x, count):
-                low = dr.clip(mi.Int(dr.floor(x)), 0, count - 2)
-                return low, dr.clip(x - low, 0, 1)
-
-            def node(i):
-                return dr.square(mi.Float(i) / (n_h - 1)) * (0.5 * math.pi)
-
-            i, _ = bracket(dr.sqrt(theta_h * (2 / math.pi)) * (n_h - 1), n_h)
-            f_h = dr.clip((theta_h - node(i)) / (node(i + 1) - node(i)), 0, 1)
-            j, f_d = bracket(theta_d * (2 / math.pi) * (n_d - 1), n_d)
-            k, f_p = bracket(phi_d * (2 / math.pi) * (n_p - 1), n_p)
-            total = mi.Color3f(0)
-            for a, w_a in ((i, 1 - f_h), (i + 1, f_h)):
-                for b, w_b in ((j, 1 - f_d), (j + 1, f_d)):
-                    for e, w_e in ((k, 1 - f_p), (k + 1, f_p)):
-                        value = dr.gather(mi.Color3f, self.values, (a * n_d + b) * n_p + e)
-                        total += w_a * w_b * w_e * value
-            return total
-
-        def upright(self, view, light):
-            side = dr.sign(view.z)
-            view = mi.Vector3f(view.x, view.y, side * view.z)
-            light = mi.Vector3f(light.x, light.y, side * light.z)
-            return view, light, (view.z > 0) & (light.z > 0)
-
-        def eval(self, ctx, si, wo, active=True):
-            view, light, above = self.upright(si.wi, wo)
-            return dr.select(active & above, self.look_up(light, view) * light.z, 0)
-
-        def pdf(self, ctx, si, wo, active=True):
-            view, light, above = self.upright(si.wi, wo)
-            half = dr.normalize(view + light)
-            lobe = self.spread.pdf(view, half) / (4 * dr.dot(view, half))
-            even = mi.warp.square_to_cosine_hemisphere_pdf(light)
-            return dr.select(active & above, 0.5 * (lobe + even), 0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            view, _, _ = self.upright(si.wi, si.wi)
-            half, _ = self.spread.sample(view, sample2)
-            even = mi.warp.square_to_cosine_hemisphere(sample2)
-            light = dr.select(sample1 < 0.5, even, mi.reflect(view, half))
-            drawn = mi.BSDFSample3f()
-            drawn.wo = mi.Vector3f(light.x, light.y, dr.sign(si.wi.z) * light.z)
-            drawn.eta = 1.0
-            drawn.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            drawn.sampled_component = mi.UInt32(0)
-            drawn.pdf = self.pdf(ctx, si, drawn.wo, active)
-            value = self.eval(ctx, si, drawn.wo, active)
-            return drawn, dr.select(drawn.pdf > 0, value / drawn.pdf, 0)
-
-        def traverse(self, callback):
-            pass
-
-        def to_string(self):
-            return f"Table{self.counts}"
-
-    return Table
-
-
-def their_map(mi, environment):
-    """Rows of theirs stand at multiples of pi / (H - 1), columns are centred; u = 0.5 is +z."""
-    rows, columns, _ = environment.image.shape
-    wide = environment.image.repeat(FINER, axis=1)
-    edge = np.arange(FINER * rows + 1)
-    above = np.maximum(edge - 1, 0) // FINER
-    below = np.minimum(edge // FINER, rows - 1)
-    fine = 0.5 * (wide[above] + wide[below])
-    fine = np.roll(fine, FINER * columns // 2, axis=1)
-    return {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(fine, np.float32)),
-        "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], math.degrees(environment.rotation)),
-    }
-
-
-def their_mesh(mi, shape, part, material):
-    chosen = shape.face_part == part
-    corners = shape.faces[chosen]
-    normals = shape.normals[corners] if shape.normals.ndim == 2 else shape.normals[chosen]
-    settings = mi.Properties()
-    settings["material"] = material
-    count = 3 * len(corners)
-    mesh = mi.Mesh(shape.parts[part], count, len(corners), settings, has_vertex_normals=True)
-    fields = mi.traverse(mesh)
-    fields["vertex_positions"] = shape.vertices[corners].ravel().astype(np.float32)
-    fields["vertex_normals"] = normals.ravel().astype(np.float32)
-    fields["faces"] = np.arange(count, dtype=np.uint32)
-    fields.update()
-    return mesh
-
-
-def their_scene(mi, scene, material):
-    """Our scene in Mitsuba, every part of the one material."""
-    shape = scene.shape
-    content = {"type": "scene"}
-    if scene.environment.image.any():
-        content["map"] = their_map(mi, scene.environment)
-    if isinstance(shape, Sphere):
-        place = {"center": list(map(float, shape.center)), "radius": float(shape.radius)}
-        content["sphere"] = {"type": "sphere", "material": material, **place}
-    else:
-        for part, name in enumerate(shape.parts):
-            content[name] = their_mesh(mi, shape, part, material)
-    if scene.ground:
-        x, _, z = shape.center
-        place = mi.ScalarTransform4f().translate([float(x), shape.lowest, float(z)])
-        place = place.rotate([1, 0, 0], -90).scale(scene.ground * shape.radius)
-        content["ground"] = {"type": "disk", "to_world": place, "material": material}
-    for i, light in enumerate(scene.lights):
-        if isinstance(light, PointLight):
-            level = {"type": "rgb", "value": list(light.intensity)}
-            theirs = {"type": "point", "position": list(light.position), "intensity": level}
-        else:
-            level = {"type": "rgb", "value": list(light.irradiance)}
-            away = [-c for c in light.direction]
-            theirs = {"type": "directional", "direction": away, "irradiance": level}
-        content[f"light{i}"] = theirs
-    stands = scene.camera.position(shape, scene.height, scene.width)
-    target = shape.center if scene.camera.target is None else scene.camera.target
-    content["camera"] = {
-        "type": "perspective",
-        "fov": scene.camera.fov,
-        "fov_axis": "y",
-        "to_world": mi.ScalarTransform4f().look_at(
-            list(map(float, stands)), list(map(float, target)), [0, 1, 0]
-        ),
-        "film": {
-            "type": "hdrfilm",
-            "width": scene.width,
-            "height": scene.height,
-            "rfilter": {"type": "box"},
-        },
-    }
-    return mi.load_dict(content)
-
-
-def their_rays(peer, theirs, scene, index, each):
-    """`each` rays through the centre of every fragment's pixel."""
-    mi, dr = peer.mi, peer.dr
-    y, x = np.divmod(scene.pixels[index], scene.width)
-    at = np.stack([(x + 0.5) / scene.width, (y + 0.5) / scene.height]).astype(np.float32)
-    which = dr.arange(mi.UInt32, len(index) * each) // each
-    place = dr.gather(mi.Point2f, mi.Point2f(at), which)
-    ray, _ = theirs.sensors()[0].sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5))
-    return ray
-
-
-def integrator(mi):
-    """Light that is scattered once.
-
-    Not their "direct": of several samples it adds up what lamps give instead of averaging it
-    (mitsuba3 issue 1861).
-    """
-    return mi.load_dict({"type": "path", "max_depth": 2})
+            pytest.fail(str(error))
+        pytest.skip(str(error))
 
 
 def path_traced(peer, scene, index, table, alpha, samples):
     """Mitsuba's radiance of fragments: mean and its standard error, (m, 3) each."""
-    mi = peer.mi
-    theirs = their_scene(mi, scene, peer.material(table, alpha))
-    direct_light = integrator(mi)
-    runs = []
-    for seed in range(SEEDS):
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, len(index) * samples)
-        ray = their_rays(peer, theirs, scene, index, samples)
-        spectrum, _, _ = direct_light.sample(theirs, sampler, ray)
-        runs.append(np.array(spectrum, np.float64).T.reshape(len(index), samples, 3).mean(axis=1))
+    theirs = their_scene(peer.mi, scene, peer.material(table, alpha), FINER)
+    pixels = scene.pixels[index]
+    runs = [
+        traced(peer, theirs, scene, pixels, samples, seed, "independent") for seed in range(SEEDS)
+    ]
     return np.mean(runs, axis=0), np.std(runs, axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
@@ -353,7 +150,7 @@ def test_maps_are_turned_alike(peer):
     environment = bright_map()
     w = np.random.default_rng(1).normal(size=(5_000, 3))
     w /= np.linalg.norm(w, axis=-1, keepdims=True)
-    emitter = mi.load_dict(their_map(mi, environment))
+    emitter = mi.load_dict(their_map(mi, environment, FINER))
     seen = dr.zeros(mi.SurfaceInteraction3f, len(w))
     seen.wi = mi.Vector3f(-w.T.astype(np.float32))
     theirs, ours = np.array(emitter.eval(seen)).T, environment.radiance(w)
@@ -368,15 +165,61 @@ def test_maps_are_turned_alike(peer):
 def test_cameras_see_alike(peer, name):
     scene = make_scene(name)
     index = inner_fragments(scene, 500)
-    theirs = their_scene(
-        peer.mi, scene, peer.material(TabulatedBRDF.from_model(Lambert(), GRID), 1)
-    )
-    hit = theirs.ray_intersect(their_rays(peer, theirs, scene, index, 1))
+    table = TabulatedBRDF.from_model(Lambert(), GRID)
+    theirs = their_scene(peer.mi, scene, peer.material(table, 1.0), FINER)
+    hit = theirs.ray_intersect(their_rays(peer, theirs, scene, scene.pixels[index], 1))
     first = scene.offsets[index]
     np.testing.assert_allclose(np.array(hit.p).T, scene.positions[first], atol=2e-5)
     normal = np.array(hit.sh_frame.n).T
     facing = np.sign(np.sum(normal * scene.views[first], axis=-1, keepdims=True))
     np.testing.assert_allclose(facing * normal, scene.normals[first], atol=2e-5)
+
+
+def test_an_edit_is_another_table_and_compiles_nothing(peer):
+    """What stands beside our edits: it must be the table asked for, at no cost but its samples."""
+    scene = make_scene("teapot")
+    pixels = scene.pixels[inner_fragments(scene, 40)]
+    before, after = (
+        TabulatedBRDF.from_model(MODELS[name][0], GRID) for name in MODELS if name != "glossy"
+    )
+    material = peer.material(before, 0.5)
+    theirs = their_scene(peer.mi, scene, material)
+    first = traced(peer, theirs, scene, pixels, 16, 0)
+    peer.dr.set_flag(peer.dr.JitFlag.KernelHistory, True)
+    try:
+        peer.dr.kernel_history_clear()
+        material.assign(after, *fit_lobe(after))
+        second = traced(peer, theirs, scene, pixels, 16, 1)
+        compiled = [k for k in peer.dr.kernel_history() if not k.get("cache_hit", True)]
+    finally:
+        peer.dr.set_flag(peer.dr.JitFlag.KernelHistory, False)
+    assert not compiled
+    anew = their_scene(peer.mi, scene, peer.material(after, *fit_lobe(after)))
+    np.testing.assert_allclose(second, traced(peer, anew, scene, pixels, 16, 1), rtol=1e-4)
+    assert np.abs(second - first).mean() > 0.1 * first.mean()
+    with pytest.raises(ValueError, match="folded grid"):
+        material.assign(TabulatedBRDF.from_model(Lambert(), HalfDiffGrid(8, 4, 3)), 1.0)
+
+
+def test_launches_do_not_share_random_numbers(peer, monkeypatch):
+    """A frame in several launches errs as one in a single launch does, and is no less random."""
+    scene = make_scene("teapot")
+    pixels = scene.pixels[inner_fragments(scene, 60)]
+    table = TabulatedBRDF.from_model(MODELS["glossy"][0], GRID)
+    theirs = their_scene(peer.mi, scene, peer.material(table, *fit_lobe(table)))
+    whole = traced(peer, theirs, scene, pixels, 4096, 0)
+    monkeypatch.setattr(peers, "_LAUNCH", 20 * 16)
+    cut = np.stack([traced(peer, theirs, scene, pixels, 16, seed) for seed in range(64)])
+    assert len(np.unique(cut[:, 0, 0])) == 64
+    assert reference.relative_error(cut.mean(axis=0), whole) < 0.04
+    # the same pixel three times over, in three launches
+    thrice = traced(peer, theirs, scene, np.repeat(pixels[:1], 60), 16, 0)
+    assert len(np.unique(thrice[:, 0])) == 60
+
+
+def test_the_number_of_samples_is_what_they_draw(peer):
+    assert peers.rounded(peer, 16) == 16
+    assert peers.rounded(peer, 97) >= 97
 
 
 # ---------------------------------------------------------------------------------------------
@@ -416,7 +259,7 @@ def test_borders_are_theirs(peer, name):
     scene = Scene(shape, dark, LAMPS[1:], camera, size=(24, 30), subsamples=64)
     model, alpha = MODELS["glossy"]
     table = TabulatedBRDF.from_model(model, GRID)
-    theirs = their_scene(peer.mi, scene, peer.material(table, alpha))
+    theirs = their_scene(peer.mi, scene, peer.material(table, alpha), FINER)
     shown = np.array(peer.mi.render(theirs, integrator=integrator(peer.mi), spp=8192), np.float64)
     at_border = np.unique(scene.pixels[scene.bordering])
     assert len(at_border) > 100
@@ -424,3 +267,29 @@ def test_borders_are_theirs(peer, name):
     difference = shown.reshape(-1, 3)[at_border] - ours
     assert abs(np.mean(difference)) < 0.005 * np.mean(ours)
     assert np.mean(np.abs(difference)) < 0.025 * np.mean(ours)
+
+
+# ---------------------------------------------------------------------------------------------
+# edits beside theirs
+
+
+def test_bench_beside_mitsuba(peer, shared_data):
+    records = {r.name: r for r in bench.run(["peers"], shared_data, True, lambda line: None)}
+    agreement = records["Mitsuba, converged, against our reference"]
+    assert agreement.value < 1.0
+    ratios = [r for name, r in records.items() if name.startswith("times as fast as Mitsuba")]
+    assert len(ratios) == len(bench.PEER_MATERIALS) + 1
+    assert min(r.value for r in ratios) > 1.0
+    for name in bench.PEER_MATERIALS:
+        ours, theirs = (
+            records[f"{who}, {name}, edit to frame{more}"]
+            for who, more in (("ours", ""), ("Mitsuba", ", at 2 %"))
+        )
+        assert ours.error < 0.01
+        assert 0.01 < theirs.error < 0.04
+        assert records[f"Mitsuba, {name}, one sample a pixel"].error > 0.2
+    assert records["edits until we are ahead, most, at 2 %"].value >= 1.0
+    for r in records.values():
+        assert r.error is None or math.isfinite(r.error)
+        if r.unit == "ms":
+            assert r.error is not None
