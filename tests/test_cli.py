@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from PIL import Image
 
 import traitbrdf as tb
-from traitbrdf import bench
+from traitbrdf import bench, peers
 from traitbrdf.cli import main
 from traitbrdf.formats import read_image, write_exr
 
@@ -207,6 +209,19 @@ def test_texel_sum_is_the_reference_for_a_rough_surface() -> None:
     assert tb.reference.relative_error(plain, true[:, 0]) < 2e-3
 
 
+def test_the_texel_sum_in_torch_is_that_in_numpy() -> None:
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=64).rotated(0.7), size=10)
+    index = np.flatnonzero(~scene.bordering)[::3]
+    for name in ("gold-polished", "blue-plastic"):
+        brdf = tb.default_library()[name]
+        plain = bench.texel_sum(scene, index, brdf)
+        other = bench.texel_sum_torch(scene, index, brdf)
+        np.testing.assert_allclose(other, plain, rtol=1e-3)
+    merl = tb.TabulatedBRDF(tb.HalfDiffGrid(4, 4, 4, "merl"), np.ones((4, 4, 4, 3)))
+    with pytest.raises(ValueError, match="folded"):
+        bench.texel_sum_torch(scene, index, merl)
+
+
 def test_unseen_tables_are_new() -> None:
     kinds = bench.unseen(None, quick=True)
     assert {"held-out library", "new recipes", "manifold moves", "models"} <= set(kinds)
@@ -321,6 +336,39 @@ def test_bad_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "broken.tbr" in fails(capsys, "render", "--design", str(design), "--out", out)
     assert ".gif" in fails(capsys, "render", "--out", str(tmp_path / "x.gif"))
     assert ".txt" in fails(capsys, "info", str(tmp_path / "x.txt"))
+
+
+def test_bench_beside_mitsuba_says_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    peers.load.cache_clear()
+    try:
+        assert "traitbrdf[peers]" in fails(capsys, "bench", "--peers", "--quick")
+    finally:
+        peers.load.cache_clear()
+
+
+def test_mitsuba_is_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[str] = []
+    for name in bench.BENCHES:
+
+        def noted(*_: object, name: str = name) -> Iterator[bench.Record]:
+            """Nothing is measured."""
+            called.append(name)
+            return iter(())
+
+        monkeypatch.setitem(bench.BENCHES, name, noted)
+    assert main(["bench"]) == 0
+    assert "edit" in called
+    assert not bench.ON_REQUEST & set(called)
+    for arguments in (["--peers"], ["peers"], ["peers", "--peers"]):
+        called.clear()
+        assert main(["bench", *arguments]) == 0
+        assert called == ["peers"]
+    called.clear()
+    assert main(["bench", "edit", "--peers"]) == 0
+    assert called == ["edit", "peers"]
 
 
 def test_unknown_bench(capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,8 +129,15 @@ def _parser() -> argparse.ArgumentParser:
 
     timing = commands.add_parser("bench", help="errors and times, measured in one run")
     timing.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"of {', '.join(bench.BENCHES)} (default: all)"
-    )
+        "names", nargs="*", metavar="NAME",
+        help=f"of {', '.join(bench.BENCHES)} "
+        f"(default: all but {', '.join(sorted(bench.ON_REQUEST))})",
+    )  # fmt: skip
+    timing.add_argument(
+        "--peers", action="store_true",
+        help="beside Mitsuba 3, at equal error: the same as to name 'peers' (some 10 minutes; "
+        "needs traitbrdf[peers])",
+    )  # fmt: skip
     timing.add_argument("--quick", action="store_true", help="small sizes, some two minutes")
     timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records")
     timing.add_argument(
@@ -477,6 +484,9 @@ def _bench(given: argparse.Namespace) -> int:
     for name in given.names:
         if name not in bench.BENCHES:
             raise ValueError(unknown_name("bench", name, tuple(bench.BENCHES)))
+    names = list(given.names)
+    if given.peers and "peers" not in names:
+        names.append("peers")
     if given.data is not None and not given.data.is_dir():
         raise FileNotFoundError(f"--data: no such folder: {given.data}")
     if given.json is not None:
@@ -484,7 +494,7 @@ def _bench(given: argparse.Namespace) -> int:
     data = given.data or bench.default_data()
     if data is None:
         print("no folder of real maps and materials: under the procedural sky, without RGL")
-    records = bench.run(given.names, data, given.quick, lambda line: print(line, flush=True))
+    records = bench.run(names, data, given.quick, lambda line: print(line, flush=True))
     if given.json is not None:
         given.json.write_text(json.dumps([r.as_dict() for r in records], indent=1) + "\n")
     return 0
