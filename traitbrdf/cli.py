@@ -6,6 +6,7 @@ Exit status: 0 done, 1 failed with one readable line, 2 wrong usage.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import sys
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import traitbrdf as tb
-from traitbrdf import bench
+from traitbrdf import bench, trade
 from traitbrdf.brdf import ALBEDO_ANGLES, Reflectance
 from traitbrdf.formats import exposure_of, tone_map, unknown_name, write_exr, write_png
 from traitbrdf.shapes import Shape
@@ -130,13 +131,22 @@ def _parser() -> argparse.ArgumentParser:
     timing = commands.add_parser("bench", help="errors and times, measured in one run")
     timing.add_argument(
         "names", nargs="*", metavar="NAME",
-        help=f"of {', '.join(bench.BENCHES)} "
+        help=f"of {', '.join(_benches())} "
         f"(default: all but {', '.join(sorted(bench.ON_REQUEST))})",
     )  # fmt: skip
     timing.add_argument(
         "--peers", action="store_true",
         help="beside Mitsuba 3, at equal error: the same as to name 'peers' (some 10 minutes; "
         "needs traitbrdf[peers])",
+    )  # fmt: skip
+    timing.add_argument(
+        "--trade", action="store_true",
+        help="every knob of speed against accuracy, alone and together: the same as to name "
+        "'trade' (some 10 minutes)",
+    )  # fmt: skip
+    timing.add_argument(
+        "--out", type=Path, metavar="FOLDER",
+        help="where the trade's trade.json and trade.png go (the plot needs traitbrdf[plots])",
     )  # fmt: skip
     timing.add_argument("--quick", action="store_true", help="small sizes, some two minutes")
     timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records")
@@ -480,13 +490,22 @@ def _info(given: argparse.Namespace) -> int:
     return 0
 
 
+def _benches(out: Path | None = None) -> dict[str, bench.Bench]:
+    """All benches by name; `out` is the folder for what the trade writes."""
+    return {
+        **bench.BENCHES,
+        "promises": trade.promises_kept,
+        "trade": functools.partial(trade.trade, out=out),
+    }
+
+
 def _bench(given: argparse.Namespace) -> int:
+    benches = _benches(given.out)
     for name in given.names:
-        if name not in bench.BENCHES:
-            raise ValueError(unknown_name("bench", name, tuple(bench.BENCHES)))
-    names = list(given.names)
-    if given.peers and "peers" not in names:
-        names.append("peers")
+        if name not in benches:
+            raise ValueError(unknown_name("bench", name, tuple(benches)))
+    asked = [name for name in ("trade", "peers") if getattr(given, name)]
+    names = [*given.names, *(name for name in asked if name not in given.names)]
     if given.data is not None and not given.data.is_dir():
         raise FileNotFoundError(f"--data: no such folder: {given.data}")
     if given.json is not None:
@@ -494,7 +513,7 @@ def _bench(given: argparse.Namespace) -> int:
     data = given.data or bench.default_data()
     if data is None:
         print("no folder of real maps and materials: under the procedural sky, without RGL")
-    records = bench.run(names, data, given.quick, lambda line: print(line, flush=True))
+    records = bench.run(names, data, given.quick, lambda line: print(line, flush=True), benches)
     if given.json is not None:
         given.json.write_text(json.dumps([r.as_dict() for r in records], indent=1) + "\n")
     return 0

@@ -86,8 +86,11 @@ DRAFT_SIZE = 128
 FRAMES_KEPT = 1 << 27
 """Bytes of finished parts that are kept, so that what is undone is shown again as it was."""
 
-_CALIBRATED = 64
+_CALIBRATED = 96
 """Materials that a promise is measured on."""
+
+_STRAY = 0.4
+"""How far half of them are from a member of the library, in widths of the box."""
 
 CACHE_BYTES = 2_000_000_000
 """Preparations on disk take at most so many bytes, unless TRAITBRDF_CACHE_BYTES says otherwise."""
@@ -1708,6 +1711,15 @@ def _promised(
     used = set(trained_members(library))
     others = [z for i, z in enumerate(library.coordinates) if i not in used]
     some = [others[i] for i in np.linspace(0, len(others) - 1, _CALIBRATED).astype(int)]
+    # edits leave the library: half of the materials are as far from it as two moves of a unit
+    rng, span = np.random.default_rng(0), embedding.high_ - embedding.low_
+    some[1::2] = [
+        np.clip(
+            z + _STRAY * span * rng.normal(size=len(z)) / math.sqrt(len(z)),
+            embedding.low_, embedding.high_,
+        )
+        for z in some[1::2]
+    ]  # fmt: skip
     tables = [embedding.decode_values(z)[cells].T for z in some]  # (3, cells)
     stacked = torch.from_numpy(np.stack(tables, axis=2).swapaxes(0, 1).copy()).to(device)
     canvas, turn = _Canvas(whole), itertools.cycle(some)

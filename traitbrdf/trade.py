@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -657,9 +657,3 @@ def _plot(
     right.set_title("one knob at a time", fontsize=10)
     right.legend(fontsize=7)
     page.savefig(path, dpi=110, format="png")
-
-
-BENCHES: dict[str, Callable[..., Iterator[Record]]] = {
-    "promises": promises_kept,
-    "trade": trade,
-}
