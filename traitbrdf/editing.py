@@ -1736,7 +1736,8 @@ def _promised(
         return canvas.image()
 
     borne = np.array([trusted_error(scene, i, 1.0) for i in range(len(scene.parts))])
-    transport, promise = keep(whole, stacked, borne, frame, quality, error, fps)
+    dimensions = len(some[0])
+    transport, promise = keep(whole, stacked, borne, frame, quality, dimensions, error, fps)
     return replace(prepared, transport=transport, promise=promise)
 
 

@@ -40,6 +40,13 @@ LADDER = (8, 12, 16, 24, 32, 48, 64, 80, 96, 120, 144)
 CASES = 0.95
 """The share of materials whose frames shall have the error asked for."""
 
+ROUNDING = 0.01
+"""Least error asked for at which float16 may keep the basis: its own is some 0.03 %."""
+
+WORTH = 0.9
+"""The share of a frame's time in float32 that float16 has to stay below to be taken: it halves
+what is read of memory, and has to be widened."""
+
 RESERVE = 0.75
 """The share of a frame's time that shading may take: the rest is for the edit, and for hours in
 which a machine is slower."""
@@ -54,6 +61,10 @@ class Promise:
     quality : what the scene was prepared with
     error, fps : what was asked for; None: nothing
     basis_images, of : how many are used, of how many that were prepared
+    dtype : what they are kept in
+    resolution : of the light's pieces and of the shadow rays (`quadrature.Operator`)
+    grid, dimensions : nodes of the tables and coordinates of the embedding, which are all used:
+        fewer of them cost more error than they save time (``traitbrdf bench --trade``)
     error_95 : the error that frames of 95 % of `materials` stay below, by the probes
     materials : how many it was measured on, none of which the basis was fitted to
     seconds : a frame of the whole object from an edited material, median
@@ -65,6 +76,10 @@ class Promise:
     fps: float | None
     basis_images: int
     of: int
+    dtype: str
+    resolution: float
+    grid: tuple[int, int, int]
+    dimensions: int
     error_95: float
     materials: int
     seconds: float
@@ -87,6 +102,7 @@ def keep(
     borne: Float64,
     frame: Callable[[Transport], object],
     quality: str,
+    dimensions: int,
     error: float | None = None,
     fps: float | None = None,
 ) -> tuple[Transport, Promise]:
@@ -98,7 +114,8 @@ def keep(
     tables : (len(transport.cells), 3, T) float32, materials that it was not fitted to
     borne : (parts,) the share of the error asked for that each part may have by its measurement
     frame : makes a frame from an edit, for its time
-    quality, error, fps : what was asked for; at most one of the last two
+    quality, dimensions : what the scene was prepared with, and how many coordinates a material has
+    error, fps : what was asked for; at most one of them
     """
     most = transport.rank_used
     ranks = [rank for rank in LADDER if rank < most] + [most]
@@ -114,13 +131,19 @@ def keep(
     while True:
         used = transport if ranks[chosen] == most else transport.truncated(ranks[chosen])
         seconds = _median_seconds(frame, used)
+        if error is None or error >= ROUNDING:
+            half = used.stored(torch.float16)
+            faster = _median_seconds(frame, half)
+            if faster < WORTH * seconds:
+                used, seconds = half, faster
         if fps is None or seconds <= RESERVE / fps or chosen == 0:
             break
         chosen -= 1
     kept = (error is None or len(good) > 0) and (fps is None or seconds <= RESERVE / fps)
     promise = Promise(
-        quality, error, fps, ranks[chosen], most, float(errors[chosen]), tables.shape[2], seconds,
-        kept,
+        quality, error, fps, ranks[chosen], most, str(used.dtype).removeprefix("torch."),
+        used.resolution, used.grid.shape, dimensions, float(errors[chosen]), tables.shape[2],
+        seconds, kept,
     )  # fmt: skip
     return used, promise
 

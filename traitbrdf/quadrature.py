@@ -331,6 +331,10 @@ class Operator:
                 edge[:-1], count[sampled], normals[members], views[members],
                 scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
             )  # fmt: skip
+        own_row = np.full(len(sample), -1, np.int32)
+        if self._visibility is not None:
+            own_row = self._visibility.row_of_sample[sample]
+            united[owner[own_row >= 0]] = False
         alone = group < 0
         group[alone] = found + np.arange(alone.sum())
         order = np.argsort(group, kind="stable")
@@ -344,11 +348,15 @@ class Operator:
         bundle_start = np.append(np.flatnonzero(fresh[group_edge]), len(group_edge))
         target = owner[sorted_samples]
         several = (count > 2)[target[group_edge]]
+        masks = mask_rows[target]
+        single_row = own_row[sorted_samples]
+        masks[single_row >= 0] = -1
+        masks[single_row >= 0, 0] = single_row[single_row >= 0]
         return _Bundles(
             bundle_start, group_start, target, normals[sorted_samples], views[sorted_samples],
             share[sorted_samples].astype(np.float32), sample[sorted_samples],
             *_centres(group_start, normals[sorted_samples], views[sorted_samples]),
-            _first_rows(group_start, mask_rows[target]), several,
+            _first_rows(group_start, masks), several,
         )  # fmt: skip
 
     def _light(
@@ -496,6 +504,8 @@ class Operator:
                 mine = (unknown >= span.start) & (unknown < span.stop)
                 around[mine] = plan.mask_rows[unknown[mine] - span.start]
             visibility.cast(unknown, around, least=3)
+            if self.resolution > 1.0:
+                visibility.cast_samples(unknown)
         return self._own_rows(index)
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
@@ -506,7 +516,8 @@ class Operator:
         if part not in self._plans:
             report = progress or (lambda stage, fraction: None)
             loose = max(1.0, 1.0 / self.resolution)
-            self._plans[part] = _Plan.make(self.scene, part, self._visibility, loose, report)
+            fine = self.resolution > 1.0
+            self._plans[part] = _Plan.make(self.scene, part, self._visibility, loose, fine, report)
         return self._plans[part]
 
 
@@ -651,6 +662,8 @@ class _Visibility:
         self.cut = cut
         self.toward = turn_about_y(cut.directions, scene.environment.rotation)
         self.row_of = np.full(len(scene.pixels), -1, np.int32)
+        # of samples with rays of their own: a fragment at a border lies on either side of an edge
+        self.row_of_sample = np.full(len(scene.normals), -1, np.int32)
         self.rows = 0
         self._sharp = cut.share > 0.02  # suns, that cast sharp shadows
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
@@ -691,10 +704,29 @@ class _Visibility:
                 bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
             self._ray(bits, index[some])
             with self._lock:
-                self._append(bits, index[some])
+                self.row_of[index[some]] = self._append(bits)
 
-    def _append(self, bits: NDArray[np.uint8], index: Int64) -> None:
-        need = self.rows + len(index)
+    def cast_samples(self, index: Int64) -> None:
+        """Rays of every sample of those of the fragments `index` that have several."""
+        offsets = self.scene.offsets
+        count = np.diff(offsets)[index]
+        some = (count > 1) & (self.row_of[index] >= 0)
+        samples, _ = _expand(offsets, index[some])
+        samples = samples[self.row_of_sample[samples] < 0]
+        nothing = np.full((2048, 4), -1, np.int32)
+        for i in range(0, len(samples), 2048):
+            chosen = samples[i : i + 2048]
+            bits = np.empty((len(chosen), len(self.cut.share)), np.uint8)
+            normals, around = self.scene.normals[chosen], nothing[: len(chosen)]
+            _inherit(bits, normals, self.toward, self._bits, around, 9, self._sharp)
+            at, node = np.nonzero(bits == 3)
+            bits[at, node] = self.scene.visible(chosen[at], self.toward[node])
+            with self._lock:
+                self.row_of_sample[chosen] = self._append(bits)
+
+    def _append(self, bits: NDArray[np.uint8]) -> Int64:
+        """Keep rows of bits; returns their numbers."""
+        need = self.rows + len(bits)
         if need > len(self._bits):
             size = max(need, len(self._bits) * 5 // 4)
             self._bits = _grown(self._bits, size)
@@ -703,7 +735,7 @@ class _Visibility:
         self._bits[rows] = bits
         _pack_bits(bits, self.cut.neighbours, *(a[rows] for a in self._masks))
         self.rows = need
-        self.row_of[index] = np.arange(rows.start, rows.stop)
+        return np.arange(rows.start, rows.stop)
 
     def _ray(self, bits: NDArray[np.uint8], index: Int64) -> None:
         """Fill the bits that are 3 by rays from the fragments `index`."""
@@ -745,6 +777,7 @@ class _Plan:
         part: int,
         visibility: _Visibility | None,
         loose: float,
+        fine: bool,
         report: Progress,
     ) -> _Plan:
         span = scene.part_slice(part)
@@ -816,6 +849,8 @@ class _Plan:
         around[border], _ = lattice.cell(border, _LEVELS[0])
         alone = np.concatenate([open_, border])
         look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
+        if casts is not None and fine:
+            casts.cast_samples(border + span.start)
         report("shadows", 1.0)
         corners[alone] = alone[:, None]
         weights[alone] = (1.0, 0.0, 0.0, 0.0)
