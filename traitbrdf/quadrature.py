@@ -13,8 +13,9 @@ node size while the number of nodes grows with its inverse square.
 *Shadows.* A cut through the tree, some thousand nodes of little light each, gets one shadow ray a
 node (`VisibilityCut`), bright lights down to single texels. Neighbouring pixels see nearly the same
 occluders: rays are cast on a coarse lattice of pixels, and between lattice points only where those
-around disagree. Near the mirror direction, where a glossy surface shows the occluder's outline,
-leaves at that outline cast their own rays.
+around disagree; at borders, where a pixel's samples lie on either side of an edge, of every sample.
+Near the mirror direction, where a glossy surface shows the occluder's outline, leaves at that
+outline cast their own rays.
 
 *Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel: they are
 computed on the lattice and interpolated, wherever normals and shadows vary linearly over its
@@ -504,8 +505,7 @@ class Operator:
                 mine = (unknown >= span.start) & (unknown < span.stop)
                 around[mine] = plan.mask_rows[unknown[mine] - span.start]
             visibility.cast(unknown, around, least=3)
-            if self.resolution > 1.0:
-                visibility.cast_samples(unknown)
+            visibility.cast_samples(unknown, self.resolution > 1.0)
         return self._own_rows(index)
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
@@ -699,28 +699,48 @@ class _Visibility:
             if verify:
                 inherited = bits[:, ::8].copy()
                 bits[:, ::8][inherited < 2] = 3
-                self._ray(bits, index[some])
+                self._ray(bits, self._middle[index[some]])
                 wrong = ((inherited != bits[:, ::8]) & (inherited < 2)).any(axis=1)
                 bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
-            self._ray(bits, index[some])
+            self._ray(bits, self._middle[index[some]])
             with self._lock:
                 self.row_of[index[some]] = self._append(bits)
 
-    def cast_samples(self, index: Int64) -> None:
-        """Rays of every sample of those of the fragments `index` that have several."""
+    def cast_samples(self, index: Int64, fine: bool) -> None:
+        """Bits of every sample of those of the fragments `index` that have several.
+
+        The first and the last get rays; where these and the middle one agree, so do the others,
+        unless all shall have them (`fine`).
+        """
         offsets = self.scene.offsets
         count = np.diff(offsets)[index]
-        some = (count > 1) & (self.row_of[index] >= 0)
-        samples, _ = _expand(offsets, index[some])
-        samples = samples[self.row_of_sample[samples] < 0]
-        nothing = np.full((2048, 4), -1, np.int32)
+        index = index[(count > 1) & (self.row_of[index] >= 0)]
+        known = self.row_of_sample[offsets[index]] >= 0
+        index = index[~known]
+        self.row_of_sample[self._middle[index]] = self.row_of[index]
+        ends = np.stack([offsets[index], offsets[index + 1] - 1], axis=1)
+        nothing = np.full((len(ends), 4), -1, np.int32)
+        for side in (0, 1):
+            self._cast_samples(ends[:, side], nothing)
+        around = nothing
+        if not fine:
+            around[:, 0] = self.row_of[index]
+            around[:, 1:3] = self.row_of_sample[ends]
+        samples, starts = _expand(offsets, index)
+        self._cast_samples(samples, np.repeat(around, np.diff(starts), axis=0))
+
+    def _cast_samples(self, samples: Int64, around: NDArray[np.int32]) -> None:
+        """Bits of those samples that have none, with rays where the rows `around` disagree."""
+        new = self.row_of_sample[samples] < 0
+        samples, around = samples[new], around[new]
         for i in range(0, len(samples), 2048):
             chosen = samples[i : i + 2048]
             bits = np.empty((len(chosen), len(self.cut.share)), np.uint8)
-            normals, around = self.scene.normals[chosen], nothing[: len(chosen)]
-            _inherit(bits, normals, self.toward, self._bits, around, 9, self._sharp)
-            at, node = np.nonzero(bits == 3)
-            bits[at, node] = self.scene.visible(chosen[at], self.toward[node])
+            _inherit(
+                bits, self.scene.normals[chosen], self.toward, self._bits,
+                around[i : i + 2048], 3, self._sharp,
+            )  # fmt: skip
+            self._ray(bits, chosen)
             with self._lock:
                 self.row_of_sample[chosen] = self._append(bits)
 
@@ -737,10 +757,10 @@ class _Visibility:
         self.rows = need
         return np.arange(rows.start, rows.stop)
 
-    def _ray(self, bits: NDArray[np.uint8], index: Int64) -> None:
-        """Fill the bits that are 3 by rays from the fragments `index`."""
+    def _ray(self, bits: NDArray[np.uint8], sample: Int64) -> None:
+        """Fill the bits that are 3 by rays from the samples (m,)."""
         at, node = np.nonzero(bits == 3)
-        bits[at, node] = self.scene.visible(self._middle[index][at], self.toward[node])
+        bits[at, node] = self.scene.visible(sample[at], self.toward[node])
 
 
 def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
@@ -849,8 +869,10 @@ class _Plan:
         around[border], _ = lattice.cell(border, _LEVELS[0])
         alone = np.concatenate([open_, border])
         look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
-        if casts is not None and fine:
-            casts.cast_samples(border + span.start)
+        if casts is not None:
+            for some in np.array_split(border, len(border) // 1024 + 1):
+                casts.cast_samples(some + span.start, fine)
+                report("shadows", 1.0)
         report("shadows", 1.0)
         corners[alone] = alone[:, None]
         weights[alone] = (1.0, 0.0, 0.0, 0.0)
