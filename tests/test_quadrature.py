@@ -310,6 +310,24 @@ def test_turning_everything_changes_nothing(ground):
     assert np.all(errors(second, first) < (5e-3 if ground else 5e-4))
 
 
+@pytest.mark.slow
+def test_samples_at_borders_have_shadows_of_their_own():
+    """Under a bright sun a border's samples are lit or not one by one; finer is nearer."""
+    image = np.full((32, 64, 3), 0.05)
+    image[9, 20] = 300.0
+    scene = Scene(teapot(), EnvironmentMap(image), camera=Camera.orbit(35.0, 25.0), size=64)
+    index = some(scene, 30, bordering=True)
+    true, _ = reference.fragments(scene, index, TABLES, 1e-3)
+    found = [errors(by_images(Operator(scene, GRID, r), index, TABLES), true) for r in (1.0, 2.0)]
+    print(f"borders: {np.median(found[0]):.4f} and, finer, {np.median(found[1]):.4f}")
+    assert np.median(found[0]) < 0.02
+    assert np.median(found[1]) < 0.006
+    # without them all samples see what the middle one does
+    blind = Operator(scene, GRID, 2.0)
+    blind._visibility.cast_samples = lambda index, fine: None
+    assert np.median(errors(by_images(blind, index, TABLES), true)) > 2.0 * np.median(found[1])
+
+
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_how_fragments_are_grouped_does_not_show(make):
     scene = make()
