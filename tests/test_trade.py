@@ -38,6 +38,7 @@ def test_a_knee_is_where_time_stops_paying():
     front = [point(1.0, 0.1), point(1.5, 0.02), point(2.0, 0.004), point(8.0, 0.0035)]
     assert knee(front).milliseconds == 2.0
     assert knee(front[:1]) is front[0]
+    assert knee([*front, point(1.2, 0.5)]).milliseconds == 2.0  # what is slower and worse is no end
 
 
 def test_coarser_maps_hold_the_same_light():

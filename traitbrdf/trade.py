@@ -421,10 +421,19 @@ def pareto(points: Sequence[_Point]) -> list[_Point]:
     return sorted((p for p in points if not beaten(p)), key=lambda p: p.milliseconds)
 
 
+def _outline(points: Sequence[_Point]) -> list[_Point]:
+    """Those that no faster one equals in error, memory aside."""
+    found: list[_Point] = []
+    for p in sorted(points, key=lambda p: (p.milliseconds, p.error)):
+        if not found or p.error < found[-1].error:
+            found.append(p)
+    return found
+
+
 def knee(points: Sequence[_Point]) -> _Point:
-    """Where more time stops paying: the point of a front furthest below the line between its ends,
-    time and error both as logarithms."""
-    front = sorted(points, key=lambda p: p.milliseconds)
+    """Where more time stops paying: of time and error, both as logarithms, the point furthest below
+    the line from the fastest to the most exact."""
+    front = _outline(points)
     x = np.log([p.milliseconds for p in front])
     y = np.log([max(p.error, 1e-6) for p in front])
     width, height = max(x[-1] - x[0], 1e-9), max(y.max() - y.min(), 1e-9)
@@ -634,6 +643,7 @@ def _plot(
     """Error over time of all settings, and what each knob alone costs and brings."""
     try:
         figure = importlib.import_module("matplotlib.figure")
+        ticker = importlib.import_module("matplotlib.ticker")
     except ImportError as error:
         raise RuntimeError("the plot needs matplotlib: pip install traitbrdf[plots]") from error
     page = figure.Figure(figsize=(11, 4.6), layout="constrained")
@@ -644,7 +654,7 @@ def _plot(
             [p.milliseconds for p in some], [100 * p.error for p in some],
             s=[10 + 12 * p.resolution for p in some], marker=mark, alpha=0.6, label=kind,
         )  # fmt: skip
-    line = sorted(front, key=lambda p: p.milliseconds)
+    line = _outline(front)
     left.plot([p.milliseconds for p in line], [100 * p.error for p in line], "k-", lw=0.8)
     left.annotate(
         f"knee: {best.label}", (best.milliseconds, 100 * best.error), (0.35, 0.85),
@@ -659,8 +669,12 @@ def _plot(
         at = np.linspace(0.0, 1.0, len(own)) if len(own) > 1 else np.zeros(1)
         right.plot(at, [100 * s[3] for s in own], ".-", lw=0.8, label=name)
         for x, s in ((at[0], own[0]), (at[-1], own[-1])):
-            right.annotate(s[1], (x, 100 * s[3]), fontsize=6)
+            right.annotate(s[1], (x, 100 * s[3]), fontsize=6, ha="left" if x == 0.0 else "right")
     right.set(yscale="log", ylabel="frame error, %", xlabel="each knob from end to end", xticks=[])
     right.set_title("one knob at a time", fontsize=10)
+    for axis in (left.xaxis, left.yaxis, right.yaxis):
+        axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(ticker.NullFormatter())
     right.legend(fontsize=7)
     page.savefig(path, dpi=110, format="png")
