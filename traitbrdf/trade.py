@@ -564,7 +564,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         say(f"  {out / 'trade.json'} and {out / 'trade.png'} hold all of it")
     how = (
         f"{len(scenes)} scenes of {size}x{size}, {len(tables)} unseen BRDFs, {len(points)} "
-        "settings of images, number type and resolution; "
+        f"settings of images, number type and resolution, {torch.get_num_threads()} threads; "
     )
     moved = _bytes_moved(scenes, best)
     yield Record(
