@@ -23,6 +23,7 @@ from traitbrdf.promises import QUALITIES
 from traitbrdf.quadrature import Operator
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, sphere, teapot
+from traitbrdf.trade import _sheet
 from traitbrdf.traits import default_traits
 from traitbrdf.transport import Transport
 
@@ -76,16 +77,8 @@ def ball_mesh(rings=24):
     theta = np.linspace(0.0, math.pi, rings + 1)
     phi = np.linspace(0.0, 2.0 * math.pi, 2 * rings + 1)
     t, p = np.meshgrid(theta, phi, indexing="ij")
-    points = np.stack([np.sin(t) * np.sin(p), np.cos(t), np.sin(t) * np.cos(p)], -1).reshape(-1, 3)
-    at = np.arange(len(points)).reshape(t.shape)
-    a, b, c, d = at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]
-    faces = np.concatenate(
-        [np.stack([a, b, c], -1)[1:].reshape(-1, 3), np.stack([a, c, d], -1)[:-1].reshape(-1, 3)]
-    )
-    # the first row of the one and the last row of the other have no area
-    lower = np.stack([a, b, c], -1)[:1].reshape(-1, 3)
-    faces = np.concatenate([faces, lower])
-    return Mesh(points, faces, points, np.zeros(len(faces), int), ("ball",))
+    points = np.stack([np.sin(t) * np.sin(p), np.cos(t), np.sin(t) * np.cos(p)], axis=-1)
+    return _sheet(points, points, "ball")
 
 
 def finite(values):

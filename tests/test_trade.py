@@ -75,7 +75,6 @@ def test_bandwidth_is_plausible():
 
 @pytest.mark.slow
 def test_the_trade_is_printed_written_and_drawn(tmp_path, capsys):
-    pytest.importorskip("matplotlib")
     arguments = ["bench", "--trade", "--quick", "--out", str(tmp_path / "t")]
     assert main([*arguments, "--json", str(tmp_path / "r.json")]) == 0
     said = capsys.readouterr().out

@@ -252,9 +252,9 @@ def _speeds(
     some = list(tables[:: max(len(tables) // 8, 1)])
     for size, camera in sizes:
         scene = Scene(teapot(), environment, camera=camera, size=size, ground=True)
-        objects = Scene.part_slice(scene, len(scene.shape.parts) - 1).stop
+        objects = scene.part_slice(len(scene.shape.parts) - 1).stop
         with Oracle(some, 1e-3) as oracle:
-            checked = _of_objects(oracle, scene, objects, 16 if quick else 60)
+            checked, _ = _inside(oracle, scene, slice(objects), 16 if quick else 60, 9)
         whole = None
         for fps in (60.0, 30.0):
             session = EditSession(scene, fps=fps, cache=False)
@@ -285,14 +285,15 @@ def _speeds(
             )  # fmt: skip
 
 
-def _of_objects(oracle: Oracle, scene: Scene, objects: int, count: int) -> _Checked:
-    """Pixels that show nothing but the object, and what the oracle says of them."""
-    rng = np.random.default_rng(9)
-    index = np.flatnonzero(~scene.bordering[:objects])
-    index = np.sort(rng.permutation(index)[:count])
+def _inside(
+    oracle: Oracle, scene: Scene, among: slice, count: int, seed: int
+) -> tuple[_Checked, Int64]:
+    """Pixels that show one fragment alone, of those `among`; and which these are."""
+    index = np.flatnonzero(~scene.bordering[among])
+    index = np.sort(np.random.default_rng(seed).permutation(index)[:count])
     values, _ = oracle(scene, index)
     known = np.isfinite(values).all(axis=(1, 2))
-    return _Checked(scene.pixels[index[known]], values[known])
+    return _Checked(scene.pixels[index[known]], values[known]), index[known]
 
 
 # -- the trade ------------------------------------------------------------------------------------
@@ -322,6 +323,10 @@ class _Measured(NamedTuple):
     checked: _Checked
     fragments: Int64  # the checked ones
     transports: dict[float, tuple[Transport, float]]
+
+    @property
+    def usual(self) -> Transport:
+        return self.transports[QUALITIES["interactive"][1]][0]
 
 
 def _frame(transport: Transport, values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -454,12 +459,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
     with Oracle(tables, 1e-3) as oracle:
         for stage in stages:
             scene = stage.scene(size)
-            rng = np.random.default_rng(11)
-            index = np.sort(rng.permutation(np.flatnonzero(~scene.bordering))[:count])
-            values, _ = oracle(scene, index)
-            known = np.isfinite(values).all(axis=(1, 2))
-            index, values = index[known], values[known]
-            checked = _Checked(scene.pixels[index], values)
+            checked, index = _inside(oracle, scene, slice(None), count, 11)
             transports = {}
             for resolution in resolutions:
                 start = time.perf_counter()
@@ -527,12 +527,11 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         label = f"{rows // factor} rows"
         settings.append(("map", label, *np.mean(found, axis=0)[[2, 0, 1]].tolist()))
         _say_setting(settings[-1], say, "a fragment")
-    whole_of = {id(s): s.transports[QUALITIES["interactive"][1]][0] for s in scenes}
     for shape in (GRID.shape, (60, 16, 7), (45, 12, 5), (30, 8, 4)):
         coarse = [t.regrid(HalfDiffGrid(*shape)).regrid(GRID) for t in tables]
         errors = []
         for one in scenes:
-            errors += _frame_errors(whole_of[id(one)], one.checked, coarse)
+            errors += _frame_errors(one.usual, one.checked, coarse)
         knob("table grid", "x".join(map(str, shape)), None, 12e-6 * math.prod(shape), errors)
     embedding = default_library().embedding
     grey, coloured = embedding.n_components
@@ -544,7 +543,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         fewer = [embedding.decode(np.where(kept, z, 0.0)) for z in codes]
         errors = []
         for one in scenes:
-            errors += _frame_errors(whole_of[id(one)], one.checked, fewer)
+            errors += _frame_errors(one.usual, one.checked, fewer)
         knob("embedding", f"{int(kept.sum())} numbers", None, math.nan, errors)
     say("  -- together: what nothing else beats in time, memory and error at once")
     front = pareto(points)
@@ -601,12 +600,8 @@ def _say_setting(setting: tuple[str, str, float | None, float, float], say: Say,
 
 def _bytes_moved(scenes: Sequence[_Measured], point: _Point) -> float:
     """What a frame has to read and write at the least: basis, projection, radiance and image."""
-    moved = []
-    for one in scenes:
-        used = one.transports[point.resolution][0].truncated(point.images)
-        used = used.stored(getattr(torch, point.dtype))
-        moved.append(used.bytes + 12 * (2 * len(one.scene.pixels) + len(one.scene.uncovered)))
-    return float(np.mean(moved))
+    shown = [12 * (2 * len(s.scene.pixels) + len(s.scene.uncovered)) for s in scenes]
+    return 1e6 * point.megabytes + float(np.mean(shown))
 
 
 def _write(
