@@ -5,6 +5,9 @@ the families so that any prefix is varied, then random members family by family.
 isotropic, reciprocal and has a proven or checked albedo of at most 1 (``model.energy_bounded``):
 layers are either coats (`Coated`, `Plastic`), convex mixtures, or sums whose albedos add to at
 most 1. Colours are linear Rec.709 albedos.
+
+A seed gives the same materials on every processor: numbers are rounded (`_rounded`) before models,
+names or choices depend on them.
 """
 
 from __future__ import annotations
@@ -124,6 +127,19 @@ _STONES: Mapping[str, RGB] = MappingProxyType(
         "concrete": (0.33, 0.32, 0.30),
     }
 )
+
+
+DIGITS = 9
+"""Significant digits of what is drawn, and of what is reckoned from that."""
+
+
+def _rounded(value: float) -> float:
+    """The nearest number of `DIGITS` digits.
+
+    The 16th digit of a logarithm, a power, a sum or an array's element depends on the processor,
+    for which libraries choose their instructions; nothing else may.
+    """
+    return float(f"{value:.{DIGITS}g}")
 
 
 # ---------------------------------------------------------------------------------------------
@@ -267,13 +283,13 @@ def _scale(colour: RGB, factor: float, normalise: float | None = None) -> RGB:
     """`colour` times `factor`, or brought to the maximum `normalise`; at most 0.95."""
     if normalise is not None:
         factor = normalise / max(*colour, 1e-6)
-    r, g, b = (min(c * factor, 0.95) for c in colour)
+    r, g, b = (_rounded(min(c * factor, 0.95)) for c in colour)
     return r, g, b
 
 
 def _desaturate(colour: RGB, amount: float) -> RGB:
     mean = sum(colour) / 3.0
-    r, g, b = (c + amount * (mean - c) for c in colour)
+    r, g, b = (_rounded(c + amount * (mean - c)) for c in colour)
     return r, g, b
 
 
@@ -290,14 +306,14 @@ class _Draw:
         self._phase = (offset + step * 0.6180339887498949) % 1.0
 
     def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
+        return _rounded(self.rng.uniform(low, high))
 
     def log(self, low: float, high: float) -> float:
-        return float(math.exp(self.rng.uniform(math.log(low), math.log(high))))
+        return _rounded(math.exp(self.rng.uniform(math.log(low), math.log(high))))
 
     def spread(self, low: float, high: float) -> float:
         """Log-spaced in [low, high], stepping evenly from member to member."""
-        return float(math.exp(math.log(low) + self._phase * math.log(high / low)))
+        return _rounded(math.exp(math.log(low) + self._phase * math.log(high / low)))
 
     def pick(self, names: Mapping[str, RGB] | tuple[str, ...]) -> str:
         options = tuple(names)
@@ -305,8 +321,10 @@ class _Draw:
 
     def vary(self, colour: RGB, amount: float = 0.15) -> RGB:
         """`colour` with each channel and the whole changed by some `amount`."""
-        factors = np.exp(self.rng.normal(0.0, amount * 0.5, 3) + self.rng.normal(0.0, amount))
-        r, g, b = (min(float(c * f), 0.9) for c, f in zip(colour, factors, strict=True))
+        changes = self.rng.normal(0.0, amount * 0.5, 3) + self.rng.normal(0.0, amount)
+        r, g, b = (
+            _rounded(min(c * math.exp(x), 0.9)) for c, x in zip(colour, changes, strict=True)
+        )
         return r, g, b
 
     def colour(self, names: tuple[str, ...] | None = None) -> tuple[str, RGB]:
@@ -336,7 +354,8 @@ def _metal_family(adjective: str, low: float, high: float) -> _Recipe:
 
 
 def _times(rgb: RGB, factor: float) -> RGB:
-    return rgb[0] * factor, rgb[1] * factor, rgb[2] * factor
+    r, g, b = (_rounded(c * factor) for c in rgb)
+    return r, g, b
 
 
 def _anodised(draw: _Draw) -> _Made:
@@ -532,7 +551,8 @@ def _reflectance(draw: _Draw, metallic: bool) -> tuple[str, RGB]:
     dye = draw.pick(COLOURS)
     passes = draw.uniform(0.5, 2.0)
     r, g, b = (
-        v * c**passes for v, c in zip(bare, _scale(COLOURS[dye], 1.0, normalise=1.0), strict=True)
+        _rounded(v * c**passes)
+        for v, c in zip(bare, _scale(COLOURS[dye], 1.0, normalise=1.0), strict=True)
     )
     return f"{dye}-{name}", (r, g, b)
 
@@ -560,7 +580,7 @@ def _lobe_family(adjective: str, lobe: Callable[[_Draw, RGB], tuple[Model, Param
 
 def _hazy(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
     alpha = draw.spread(0.002, 0.6)
-    wide = min(1.0, alpha * draw.log(1.5, 60.0))
+    wide = min(1.0, _rounded(alpha * draw.log(1.5, 60.0)))
     gamma, wide_gamma = draw.uniform(0.9, 3.5), draw.uniform(0.6, 3.0)
     haze = draw.log(0.01, 0.8)
     values: Parameters = {
@@ -570,7 +590,7 @@ def _hazy(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
 
 
 def _polished(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
-    b, c = 2.0 / draw.spread(0.002, 0.6) ** 2, draw.uniform(0.4, 2.5)
+    b, c = _rounded(2.0 / draw.spread(0.002, 0.6) ** 2), draw.uniform(0.4, 2.5)
     return ABC(1.0, r0, b, c), {"b": b, "c": c}
 
 
@@ -583,8 +603,8 @@ def _blasted(draw: _Draw, r0: RGB) -> tuple[Model, Parameters]:
     alpha = draw.spread(0.02, 1.0)
     if draw.uniform(0.0, 1.0) < 0.5:
         return Beckmann(1.0, r0, alpha), {"alpha": alpha}
-    n = 2.0 / alpha**2
-    return BlinnPhong(1.0, r0, max(n, 1.0)), {"n": max(n, 1.0)}
+    n = max(_rounded(2.0 / alpha**2), 1.0)
+    return BlinnPhong(1.0, r0, n), {"n": n}
 
 
 def _ward(draw: _Draw) -> _Made:
@@ -598,7 +618,7 @@ def _pearl(draw: _Draw) -> _Made:
     name, colour = draw.colour()
     tint = _scale(COLOURS[draw.pick(COLOURS)], 1.0, normalise=draw.uniform(0.4, 0.95))
     tint = _desaturate(tint, draw.uniform(0.0, 1.0))
-    film, flakes = draw.uniform(0.0, 700.0), 1.0 - draw.log(0.005, 0.8)
+    film, flakes = draw.uniform(0.0, 700.0), _rounded(1.0 - draw.log(0.005, 0.8))
     index, fringes = draw.uniform(1.35, 2.4), draw.uniform(0.4, 1.0)
     flake_alpha, alpha = draw.log(0.08, 0.6), draw.spread(0.004, 0.2)
     values: Parameters = {

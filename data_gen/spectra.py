@@ -125,7 +125,7 @@ def reflectance(name: str, cosine: Float64) -> Float64:
 
 @functools.cache
 def indices(name: str) -> tuple[RGB, RGB]:
-    """n and k (R, G, B) whose Fresnel curves are nearest to those of the spectrum."""
+    """n and k (R, G, B), to four decimals, whose Fresnel curves are nearest to the spectrum's."""
     wanted = reflectance(name, _COSINES)
     wavelength, n, k = SPECTRA[name]
     found = []
@@ -139,6 +139,10 @@ def indices(name: str) -> tuple[RGB, RGB]:
         # a tenth within the ranges of the models: members of the library vary by that
         low, high = np.log([[0.06, 0.06], [4.5, 14.0]])
         start = np.clip(np.log([n[nearest], k[nearest]]), low + 1e-6, high - 1e-6)
-        found.append(np.exp(scipy.optimize.least_squares(away, start, "2-point", (low, high)).x))
-    r, g, b = np.round(found, 5).tolist()
+        # to the end, 1e-8 or nearer: what is left depends on the processor, and rounding drops it
+        fit = scipy.optimize.least_squares(
+            away, start, "3-point", (low, high), xtol=1e-14, ftol=1e-15, gtol=1e-14
+        )
+        found.append(np.exp(fit.x))
+    r, g, b = np.round(found, 4).tolist()
     return (r[0], g[0], b[0]), (r[1], g[1], b[1])
