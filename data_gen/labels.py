@@ -33,7 +33,7 @@ class Definition(NamedTuple):
     weights: Mapping[str, float]
 
 
-_METAL = {"highlight": 0.5, "reflection": 0.5}
+_METAL = {"highlight": 0.4, "reflection": 0.3, "specular": 0.3}
 
 TRAITS: Mapping[str, Definition] = MappingProxyType(
     {
@@ -47,7 +47,9 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
             ("glossiness", "gloss"),
             {"highlight": 1.0},
         ),
-        "matte": Definition("no highlight stands out", ("flat", "dull"), {"highlight": -1.0}),
+        "matte": Definition(
+            "no highlight stands out", ("flat", "dull"), {"highlight": -0.8, "gloss_20": -0.2}
+        ),
         "strength": Definition(
             "how strong reflections are",
             ("reflective", "refstrng"),
@@ -58,7 +60,9 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
             ("sharp", "refsharp"),
             {"highlight": 0.5, "width": -0.5},
         ),
-        "tint": Definition("colour of the reflections", ("tinted", "reftint"), {"tint": 1.0}),
+        "tint": Definition(
+            "colour of the reflections", ("tinted", "reftint"), {"tint": 0.8, "highlight": 0.2}
+        ),
         "specular": Definition(
             "how much light leaves as reflection", ("specularness",), {"specular": 1.0}
         ),
@@ -71,22 +75,22 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
         "silver": Definition(
             "a light, colourless metal",
             ("silvery", "silverness"),
-            {"highlight": 0.25, "reflection": 0.25, "tint": -0.25, "lightness": 0.25},
+            {"highlight": 0.3, "reflection": 0.3, "chroma": -0.2, "lightness": 0.2},
         ),
         "gold": Definition(
             "a metal of the colour of gold",
             ("golden", "gold-like"),
-            {"highlight": 0.25, "reflection": 0.25, "gold": 0.5},
+            {"highlight": 0.3, "reflection": 0.3, "lightness": 0.1, "gold": 0.3},
         ),
         "plastic": Definition(
             "a clear colourless highlight over a body",
             ("plastic-like",),
-            {"highlight": 0.35, "diffuse": 0.35, "tint": -0.3},
+            {"highlight": 0.42, "reflection": -0.24, "fresnel": 0.17, "tint": -0.17},
         ),
         "acrylic": Definition(
             "a sharp colourless highlight over a saturated body",
             ("acrylic-like", "lacquered"),
-            {"width": -0.35, "diffuse_chroma": 0.35, "tint": -0.3},
+            {"width": -0.35, "chroma": 0.35, "tint": -0.3},
         ),
         "ceramic": Definition(
             "a sharp colourless highlight over a light body",
@@ -94,19 +98,19 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
             {"width": -0.35, "diffuse": 0.35, "tint": -0.3},
         ),
         "rubber": Definition(
-            "a dull dark surface",
+            "a dull surface that mirrors nothing",
             ("rubbery", "rubber-like"),
-            {"highlight": -0.8, "lightness": -0.2},
+            {"highlight": -0.7, "flat": 0.3},
         ),
         "fabric": Definition(
             "no highlight, and light edges",
             ("cloth", "fabric-like"),
-            {"highlight": -0.85, "sheen": 0.15},
+            {"highlight": -0.6, "flat": 0.25, "sheen": 0.15},
         ),
         "soft": Definition(
             "looks soft to the touch: hardly a highlight, light edges",
             (),
-            {"highlight": -0.9, "sheen": 0.1},
+            {"highlight": -0.6, "flat": 0.2, "diffuse": 0.2},
         ),
         "hard": Definition(
             "looks hard to the touch: strong, narrow highlights",
@@ -114,7 +118,9 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
             {"highlight": 0.7, "width": -0.3},
         ),
         "rough": Definition(
-            "wide, weak highlights", ("roughness", "coarse"), {"highlight": -0.5, "width": 0.5}
+            "wide, weak highlights",
+            ("roughness", "coarse"),
+            {"highlight": -0.4, "width": 0.3, "flat": 0.3},
         ),
         "greasy": Definition(
             "strong highlights with a haze around them",
@@ -124,7 +130,7 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
         "dusty": Definition(
             "dull and pale, with light edges",
             ("dustiness", "powdery"),
-            {"highlight": -0.34, "sheen": 0.33, "diffuse_chroma": -0.33},
+            {"highlight": -0.35, "sheen": 0.15, "chroma": -0.25, "lightness": 0.25},
         ),
         "bright": Definition("how light it is", ("light", "brightness"), {"lightness": 1.0}),
         "red": Definition("more red than the other colours", ("redness",), {"red": 1.0}),

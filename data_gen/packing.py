@@ -129,7 +129,8 @@ def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
     # the cells of the highlight, which decoding mends: all from the middle to its rim
     count = len(READINGS)
     per = grid.n_theta_d * grid.n_phi_d
-    profile = np.array([np.flatnonzero(row) for row in rows[count - len(PROFILE) : count]])
+    first = READINGS.index("profile 0")
+    profile = np.array([np.flatnonzero(row) for row in rows[first : first + len(PROFILE)]])
     columns = np.flatnonzero(grid.theta_h <= HIGHLIGHT)[:, None] * per + profile[0] % per
     outer = profile[np.radians(PROFILE) > HIGHLIGHT]
     kept = np.union1d(np.flatnonzero(rows.any(axis=0)), columns)

@@ -22,7 +22,7 @@ from sklearn.utils.extmath import randomized_svd
 from data_gen.families import materials
 from data_gen.labels import TRAITS, labels
 from data_gen.tables import Progress, table_of
-from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets, spearman
+from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets
 from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.descriptors import DESCRIPTORS
 from traitbrdf.embedding import FLOOR, GRID, OPPONENT, default_library
@@ -32,6 +32,7 @@ from traitbrdf.lights import EnvironmentMap
 from traitbrdf.measured import MeasuredBRDF
 from traitbrdf.scene import Scene
 from traitbrdf.shapes import sphere
+from traitbrdf.trait_laws import spearman
 from traitbrdf.traits import RELATED, default_traits, straight
 from traitbrdf.transport import Operator
 

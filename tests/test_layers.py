@@ -24,7 +24,7 @@ FLOORS = (
     ("editing",),
     ("peers",),
     ("bench",),
-    ("trade",),
+    ("trade", "trait_laws"),
     ("studio",),
     ("cli",),
 )

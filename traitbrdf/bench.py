@@ -8,7 +8,6 @@ before they are timed.
 from __future__ import annotations
 
 import concurrent.futures
-import csv
 import importlib
 import itertools
 import math
@@ -27,7 +26,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from traitbrdf import editing, models, peers, reference
 from traitbrdf.brdf import (
@@ -37,7 +35,6 @@ from traitbrdf.brdf import (
     TabulatedBRDF,
     albedo_operator,
 )
-from traitbrdf.descriptors import LUMINANCE, READINGS, cielab, hue, reading_rows
 from traitbrdf.directions import from_half_diff_angles, shading_frame, to_local
 from traitbrdf.editing import EXACT_ABOVE, EditSession, trusted_error
 from traitbrdf.embedding import FLOOR, BRDFEmbedding, Library, default_library
@@ -48,7 +45,7 @@ from traitbrdf.profiles import HIGHLIGHT
 from traitbrdf.promises import QUALITIES, TRUSTED
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import sphere, teapot
-from traitbrdf.traits import RELATED, Trait, TraitSpace, default_traits, suggest
+from traitbrdf.traits import default_traits
 from traitbrdf.transport import Operator, Training, Transport, training_tables
 
 Float32 = NDArray[np.float32]
@@ -863,260 +860,6 @@ def log_error(
     return error
 
 
-# -- traits ---------------------------------------------------------------------------------------
-
-RATINGS = MappingProxyType(
-    {
-        "glossy": ("glossy", 0.88), "strength": ("refstrng", 0.88), "sharpness": ("refsharp", 0.88),
-        "matte": ("matte", 0.88), "metallic": ("metallic", 0.80), "hard": ("hard", 0.68),
-        "rough": ("rough", 0.68), "rubber": ("rubber", 0.68), "soft": ("soft", 0.68),
-        "fabric": ("fabric", 0.60), "bright": ("bright", 0.45), "plastic": ("plastic", None),
-        "ceramic": ("ceramic", None), "tint": ("reftint", None),
-    }
-)  # fmt: skip
-"""Traits that people have rated: the column of the ratings, and the correlation asked for."""
-
-
-def trait_laws(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Traits: agreement with people, and what moves do to the rest, to hues and to physics."""
-    if data is not None and (data / "ratings").is_dir():
-        yield from _rated(data, quick, say)
-    yield from _half_moves(24 if quick else 500, say)
-    yield from _monotone(25 if quick else 500)
-    yield from _composites(50 if quick else 10_000)
-
-
-def rated_materials(data: Path) -> tuple[list[str], Float64, dict[str, Float64]]:
-    """Names, encoded coordinates (n, k) and mean ratings (n,) by column of rated materials."""
-    with (data / "ratings" / "serrano2016_merl_half.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    known = measured_sets(data)[0]
-    embedding = default_library().embedding
-    names = [row["material"] for row in rows]
-    z = [embedding.encode_samples(*known.angles, known.materials[name]) for name in names]
-    columns = [column for column in rows[0] if column != "material"]
-    return names, np.array(z), {c: np.array([float(row[c]) for row in rows]) for c in columns}
-
-
-def _rated(data: Path, quick: bool, say: Say) -> Iterator[Record]:
-    names, z, ratings = rated_materials(data)
-    space, rng = default_traits(), np.random.default_rng(0)
-    scores = space.scores(z)
-    grades = space.grades(z)
-    repeats = 50 if quick else 1000
-    for name, (column, floor) in RATINGS.items():
-        mine, theirs = scores[:, space.index(name)], ratings[column]
-        found = spearman(mine, theirs)
-        drawn = rng.integers(len(names), size=(repeats, len(names)))
-        low, high = np.percentile([spearman(mine[i], theirs[i]) for i in drawn], [2.5, 97.5])
-        fitted = np.mean([_cross_validated(grades, theirs, rng) for _ in range(10)])
-        how = f"Spearman, {len(names)} encoded MERL slices; 95 % by bootstrap {low:.2f} to "
-        how += f"{high:.2f}; a fit to half of the ratings reaches {fitted:.2f} on the other half"
-        if floor is None:
-            yield Record(f"people, {name}", found, "", how=how)
-        else:
-            yield Record.at_least(f"people, {name}", found, "", floor, how=how)
-    theirs = ratings["glossy"]
-    labels = np.digitize(theirs, np.quantile(theirs, [1 / 3, 2 / 3])) - 1
-    plain = [_relearnt(space, z, labels, theirs, _drawn_labels(labels, rng)) for _ in range(20)]
-    how = "Spearman with the ratings of the others, 12 labels by thirds of the ratings"
-    random = float(np.mean(plain))
-    yield Record.at_least(
-        "glossy from 12 labels", random, "", 0.85, how=f"{how}, mean of 20 random choices"
-    )
-    guided = []
-    for _ in range(20):
-        chosen = [int(i) for i in _drawn_labels(labels, rng)[:2]]
-        while len(chosen) < 12:
-            rest = [i for i in range(len(z)) if i not in chosen]
-            chosen.append(rest[suggest(z[chosen], z[rest], space)])
-        guided.append(_relearnt(space, z, labels, theirs, np.array(chosen)))
-    how += ", two random ones and ten suggested, mean of 20"
-    yield Record.at_least(
-        "glossy from suggested labels", float(np.mean(guided)), "", random, how=how
-    )
-
-
-def spearman(a: Float64, b: Float64) -> float:
-    """Rank correlation, ties shared."""
-    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
-
-
-def _cross_validated(grades: Float64, ratings: Float64, rng: np.random.Generator) -> float:
-    """Spearman on half of the materials of a ridge fit to the other half."""
-    order = rng.permutation(len(ratings))
-    fit, test = order[: len(order) // 2], order[len(order) // 2 :]
-    centre = grades[fit].mean(axis=0)
-    x, y = grades[fit] - centre, ratings[fit] - ratings[fit].mean()
-    weights = np.linalg.solve(x.T @ x + 5.0 * np.eye(x.shape[1]), x.T @ y)
-    return spearman(grades[test] @ weights, ratings[test])
-
-
-def _drawn_labels(labels: Int64, rng: np.random.Generator) -> Int64:
-    """Twelve materials with both labels among the first two."""
-    while True:
-        chosen = rng.permutation(len(labels))[:12]
-        if labels[chosen[0]] * labels[chosen[1]] < 0:
-            return chosen
-
-
-def _relearnt(
-    space: TraitSpace, z: Float64, labels: Int64, ratings: Float64, chosen: Int64
-) -> float:
-    trait = Trait.from_labels("my gloss", z[chosen], labels[chosen], space)
-    others = np.setdiff1d(np.arange(len(z)), chosen)
-    return spearman(space.grades(z[others]) @ trait.weights, ratings[others])
-
-
-def _half_moves(count: int, say: Say) -> Iterator[Record]:
-    """Moves by half a unit, of every trait from as many members in all."""
-    library, space, rng = default_library(), default_traits(), np.random.default_rng(0)
-    all_scores = space.scores(library.coordinates)
-    most = np.percentile(all_scores, 99.0, axis=0)
-    starts = rng.choice(len(library), count, replace=False)
-    whole: list[float] = []
-    drift: list[float] = []
-    held: list[float] = []
-    times: list[float] = []
-    ended: list[float] = []
-    beyond = forbidden = 0
-    for trait, name in enumerate(space.names):
-        apart = np.flatnonzero(np.abs(space.related[trait]) < RELATED)
-        reached = []
-        for i in starts:
-            z = library.coordinates[i]
-            if all_scores[i, trait] + 0.5 > most[trait]:
-                beyond += 1
-                continue
-            found = space.reach(z, {name: 0.5})
-            reached.append(found.reached[name] / 0.5)
-            if found.complete:
-                change = space.scores(found.z) - space.scores(np.clip(z, space.low, space.high))
-                drift.append(float(np.abs(change[apart]).mean()))
-            # what a user holds: colour, or some of what is not related
-            keep = [space.names[j] for j in rng.permutation(apart)[:3]]
-            start = time.perf_counter()
-            kept = space.reach(z, {name: 0.5}, keep)
-            spent = 1e3 * (time.perf_counter() - start)
-            (times if kept.complete else ended).append(spent)
-            if kept.stopped.startswith("held"):
-                forbidden += 1
-            else:
-                held += [abs(v) for v in kept.held.values()]
-        share = float(np.mean(np.array(reached) >= 0.9))
-        say(f"  {name}: {100 * share:.0f} % of {len(reached)} starts")
-        whole.append(share)
-    tried = len(starts) * len(space.names)
-    how = f"+0.5 of each trait from {count} members; {beyond} of {tried} are left out, "
-    how += "which would go beyond 99 % of the library"
-    yield Record.at_least("moves that reach 90 %, least of a trait", min(whole), "", 0.9, how=how)
-    yield Record("moves that reach 90 %, mean of traits", float(np.mean(whole)), "", how=how)
-    how = "traits of rank correlation below 0.5 with the moved one; mean |change| of a score"
-    yield Record.at_most("unrelated traits, not held", float(np.mean(drift)), "", 0.15, how=how)
-    how = "three unrelated traits at a time; greatest |change| of a score; "
-    how += (
-        f"{forbidden} of {len(times) + len(ended)} moves are refused, for what is held forbids them"
-    )
-    yield Record.at_most("unrelated traits, held", max(held), "", 0.02, how=how)
-    how = f"{len(times)} moves of +0.5 with three traits held; error: change of a held score"
-    yield Record.at_most(
-        "a held move, median", float(np.median(times)), "ms", 5.0, error=max(held), how=how
-    )
-    yield Record("a held move, 95th", float(np.percentile(times, 95.0)), "ms", how=how)
-    how = f"{len(ended)} of the same that end at the gamut, or are refused"
-    yield Record("a held move that ends early, median", float(np.median(ended)), "ms", how=how)
-
-
-def _monotone(count: int) -> Iterator[Record]:
-    """Scores by amounts of quarters, at which strides of a path end too, and by others."""
-    library, space, rng = default_library(), default_traits(), np.random.default_rng(1)
-    starts = rng.choice(len(library), count, replace=False)
-    for what, amounts in (("", 13), (" (amounts between strides)", 23)):
-        good = 0
-        for n, i in enumerate(starts):
-            z, name = library.coordinates[i], space.names[n % len(space.names)]
-            scores = [
-                space.score(space.reach(z, {name: amount}).z)[name]
-                for amount in np.linspace(-1.5, 1.5, amounts)
-            ]
-            good += bool(np.all(np.diff(scores) >= -1e-3))
-        how = f"scores rise with {amounts} amounts, -1.5 to 1.5, {count} starts, traits in turn"
-        yield Record.at_least(f"monotone moves{what}", good / count, "", 0.99, how=how)
-
-
-def _composites(count: int) -> Iterator[Record]:
-    """Random edits of two traits by up to 3: physics, and hues where colour is held."""
-    library, space, rng = default_library(), default_traits(), np.random.default_rng(2)
-    embedding = library.embedding
-    grid = embedding.grid_
-    rows = albedo_operator(grid, ALBEDO_ANGLES)
-    least, albedo, hole = math.inf, 0.0, 0.0
-    turned: list[float] = []
-    wider: list[float] = []
-    colourful = {"red", "green", "blue"}
-    for _ in range(count):
-        z = library.coordinates[rng.integers(len(library))]
-        pair = rng.choice(space.names, 2, replace=False)
-        amounts = dict(zip(pair.tolist(), rng.uniform(-3.0, 3.0, 2).tolist(), strict=True))
-        held = not colourful & set(amounts)
-        found = space.reach(z, amounts, ("colour",) if held else ())
-        before, after = (embedding.decode_values(point) for point in (embedding.clip(z), found.z))
-        least = min(least, float(after.min()))
-        albedo = max(albedo, float((rows @ after).max()))
-        hole = max(hole, highlight_hole(grid, after))
-        if held and not found.stopped.startswith("held"):  # such a move is refused
-            turned += hue_change(grid, before, after)
-            wider += hue_change(grid, before, after, whole=True)
-    how = f"{count} random edits of two traits by up to 3, {grid.size} cells each"
-    yield Record.at_least("composite edits, least f", least, "1/sr", 0.0, how=how)
-    yield Record.at_most("composite edits, greatest albedo", albedo, "", 1.001, how=how)
-    yield Record.at_most("composite edits, deepest hole", 100.0 * hole, "%", 2.0, how=how)
-    how = f"descriptors diffuse_hue and specular_hue, {len(turned)} with C*ab above 5"
-    share = float(np.mean(np.array(turned) <= 2.0))
-    yield Record.at_least("hue kept within 2 degrees, share", share, "", 1.0, how=how)
-    yield Record.at_most("hue, greatest change", max(turned), "deg", 2.0, how=how)
-    how = f"means over more of body and lobe, {len(wider)} with C*ab above 5"
-    share = float(np.mean(np.array(wider) <= 2.0))
-    yield Record("hue kept within 2 degrees, wider, share", share, "", how=how)
-
-
-def hue_change(
-    grid: HalfDiffGrid, before: NDArray[Any], after: NDArray[Any], whole: bool = False
-) -> list[float]:
-    """Degrees by which the hues of the body and of the lobe of f (cells, 3) changed, where both
-    tables have one: chroma above 5, and a lobe as high as the body.
-
-    Where descriptors read them, or over the `whole` of both: theta_h 40 to 55 and theta_d to 20
-    degrees, and theta_d 15 to 50, all phi_d.
-    """
-    found = []
-    colours = [_body_and_lobe(grid, values, whole) for values in (before, after)]
-    for one, two in zip(*colours, strict=True):
-        if one is not None and two is not None:
-            (first, pale), (second, paler) = (hue(cielab(colour)) for colour in (one, two))
-            if min(pale, paler) > 5.0:
-                away = abs(first - second) % 360.0
-                found.append(float(min(away, 360.0 - away)))
-    return found
-
-
-def _body_and_lobe(grid: HalfDiffGrid, values: NDArray[Any], whole: bool) -> list[Float64 | None]:
-    """RGB of the body's albedo and of the lobe's peak above it, scaled to white; None where there
-    is too little of it."""
-    f = np.asarray(values, np.float64)
-    if whole:
-        table, h, d = f.reshape(*grid.shape, 3), np.degrees(grid.theta_h), np.degrees(grid.theta_d)
-        body = table[(h > 40.0) & (h < 55.0)][:, d < 20.0].mean(axis=(0, 1, 2))
-        peak = table[0, (d > 15.0) & (d < 50.0)].mean(axis=(0, 1))
-    else:
-        readings = reading_rows(grid) @ f
-        body, peak = readings[READINGS.index("body")], readings[READINGS.index("profile 0")]
-    lobe = peak - body
-    dark = float(body @ LUMINANCE) < 0.004
-    stands = float(lobe @ LUMINANCE) > 0.004 + float(body @ LUMINANCE) and bool(np.all(lobe > 0.0))
-    return [None if dark else math.pi * body, lobe / lobe.max() if stands else None]
-
-
 def milliseconds(call: Callable[[], object], repeats: int) -> float:
     """Median time of a call, after one that does not count."""
     call()
@@ -1705,7 +1448,6 @@ BENCHES: dict[str, Bench] = {
     "shadows": shadow_error,
     "table": table_error,
     "embedding": embedding_error,
-    "traits": trait_laws,
     "edit": edit_speed,
     "prepare": preparation,
     "peers": peer_speed,
@@ -1713,7 +1455,7 @@ BENCHES: dict[str, Bench] = {
 
 ON_REQUEST = frozenset({"peers", "promises", "trade"})
 """What runs only where it is named: it takes long, or needs what the package does without.
-`traitbrdf.trade` has those that are not among `BENCHES`."""
+`traitbrdf.trade` and `traitbrdf.trait_laws` have those that are not among `BENCHES`."""
 
 
 def default_data() -> Path | None:

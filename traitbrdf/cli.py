@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import traitbrdf as tb
-from traitbrdf import bench, trade
+from traitbrdf import bench, trade, trait_laws
 from traitbrdf.brdf import ALBEDO_ANGLES, Reflectance
 from traitbrdf.formats import exposure_of, tone_map, unknown_name, write_exr, write_png
 from traitbrdf.shapes import Shape
@@ -71,9 +71,7 @@ def _parser() -> argparse.ArgumentParser:
         "--trait", action="append", required=True, metavar="NAME=AMOUNT", type=_trait,
         help="trait and amount, as in shiny=0.6; may be repeated",
     )  # fmt: skip
-    paint.add_argument(
-        "--hold", action="append", default=[], metavar="TRAIT", help="trait that shall stay"
-    )
+    _add_hold(paint)
     paint.add_argument("--material", default=DEMO_MATERIAL, help="library name (%(default)s)")
     paint.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
     paint.add_argument("--save", type=Path, help="also write the design (.tbr)")
@@ -116,8 +114,17 @@ def _parser() -> argparse.ArgumentParser:
         "--material", action="append", default=[], metavar="NAME",
         help=f"library names (default: {', '.join(GALLERY)})",
     )  # fmt: skip
+    _add_hold(gallery)
     gallery.add_argument(
-        "--hold", action="append", default=[], metavar="TRAIT", help="trait that shall stay"
+        "--method", choices=("flow", "linear"), default="flow",
+        help="linear: the straight vectors of Matusik et al. 2003 (%(default)s)",
+    )  # fmt: skip
+    gallery.add_argument(
+        "--amount", action="append", type=float, metavar="AMOUNT",
+        help="amounts to move by; may be repeated (default: seven from -1 to 1)",
+    )  # fmt: skip
+    gallery.add_argument(
+        "--table", action="store_true", help="one row a trait, the materials side by side"
     )
     gallery.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a sky")
     gallery.add_argument("--size", type=_size, default=96, help="pixels a sphere (%(default)s)")
@@ -332,6 +339,18 @@ def _draw_stroke(picture: NDArray[np.uint8], stroke: tb.Stroke) -> NDArray[np.ui
     return blended
 
 
+def _add_hold(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--hold", action="append", metavar="NAME",
+        help="what shall stay: a trait, colour, lightness or body; may be repeated; 'nothing' lets "
+        "go (default: colour and lightness, unless a trait is about them)",
+    )  # fmt: skip
+
+
+def _hold(given: argparse.Namespace) -> tuple[str, ...] | None:
+    return None if given.hold is None else tuple(h for h in given.hold if h != "nothing")
+
+
 def _paint(given: argparse.Namespace) -> int:
     _check_out(given.out)
     scene = _scene(given)
@@ -339,7 +358,7 @@ def _paint(given: argparse.Namespace) -> int:
     session = tb.EditSession(scene)
     session.assign(scene.shape.parts, given.material)
     before = session.scores(part)
-    session.move(part, hold=tuple(given.hold), **dict(given.trait))
+    session.move(part, hold=_hold(given), **dict(given.trait))
     after = session.scores(part)
     image = session.render()
     _write(given.out, image)
@@ -401,24 +420,34 @@ def _gallery(given: argparse.Namespace) -> int:
     library, space = tb.default_library(), tb.default_traits()
     traits = list(space.names) if "all" in given.trait else given.trait
     names = given.material or list(GALLERY)
-    steps = np.linspace(-1.0, 1.0, 7)
+    steps = given.amount or np.linspace(-1.0, 1.0, 7).tolist()
     for name in traits:
         space.index(name)
+    held = _hold(given)
+    for name in held or ():
+        space.held(name)
     environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
     given.out.parent.mkdir(parents=True, exist_ok=True)  # rather than fail after the work
-    rows, columns = {}, [f"{step:+.2f}" for step in steps] if traits else []
+    rows: dict[str, list[tb.TabulatedBRDF]] = {}
+    columns = [f"{step:+.2f}" for step in steps] if traits else []
+    if given.table:
+        # a column's label is as wide as a sphere: the end of a name says what it is
+        middle = len(steps) // 2
+        titles = [[*columns[:middle], name, *columns[middle + 1 :]] for name in names]
+        columns = [label for title in titles for label in title] if traits else list(names)
     for name in names:
         z = library.coordinates[library.index(name)]
         for trait in traits:
-            held = [h for h in given.hold if space.index(trait) not in space.members(h)]
-            moved = [space.reach(z, {trait: step}, held) for step in steps]
-            label = trait if len(names) == 1 else f"{trait}: {name}"
-            rows[label] = [library.embedding.decode(one.z) for one in moved]
+            own = space.names[space.index(trait)]
+            stay = None if held is None else [h for h in held if own not in space.held(h)]
+            moved = [space.reach(z, {trait: step}, stay, method=given.method) for step in steps]
+            label = trait if len(names) == 1 or given.table else f"{trait}: {name}"
+            rows.setdefault(label, []).extend(library.embedding.decode(one.z) for one in moved)
             for one in moved:
                 if one.stopped:
                     print(f"{name}: {one}")
         if not traits:
-            rows[name] = [library[name]]
+            rows.setdefault("" if given.table else name, []).append(library[name])
     write_png(given.out, sheet(rows, columns, environment, given.size))
     print(f"{given.out}: {len(rows)} rows")
     return 0
@@ -494,6 +523,7 @@ def _benches(out: Path | None = None) -> dict[str, bench.Bench]:
     """All benches by name; `out` is the folder for what the trade writes."""
     return {
         **bench.BENCHES,
+        "traits": trait_laws.trait_laws,
         "promises": trade.promises_kept,
         "trade": functools.partial(trade.trade, out=out),
     }

@@ -51,7 +51,7 @@ from traitbrdf.quadrature import light_tree
 from traitbrdf.scene import Camera, Scene
 from traitbrdf.shapes import Mesh, Sphere, sphere
 from traitbrdf.strokes import Stroke, region_weights
-from traitbrdf.traits import GROUPS, Move, Trait, TraitSpace, default_traits
+from traitbrdf.traits import Move, Trait, TraitSpace, default_traits
 from traitbrdf.transport import (
     AnglesSeen,
     Draft,
@@ -680,21 +680,23 @@ class EditSession:
     def move(
         self,
         part: str | Iterable[str],
-        hold: Iterable[str] = (),
+        hold: Iterable[str] | None = None,
         photoreal: bool = True,
         **amounts: float,
     ) -> None:
-        """Change traits of parts: ``edit.move("handle", shiny=0.6, hold=("colour",))``.
+        """Change traits of parts: ``edit.move("handle", shiny=0.6)``.
 
         Parameters
         ----------
         part : name or names of parts
-        hold : traits, or the group "colour", whose scores shall stay
+        hold : what shall stay: traits, "colour", "lightness", "body"; () is nothing
+            None is what `TraitSpace.holds` says: colour, unless a trait is a colour itself, and
+            lightness, unless one is about that.
         photoreal : whether to stay where materials of the library are near; `plausibility` says
             how far a material is from that
         amounts : for each trait, how much its score shall change (1: typically low to high)
 
-        Where the gamut ends before that, the furthest is shown, and `reached` says how far it is.
+        Where less is reached, the furthest is shown, and `reached` says how far that is, and why.
 
         Raises
         ------
@@ -705,7 +707,8 @@ class EditSession:
         if not amounts:
             raise ValueError("amounts: expected at least one trait, as in shiny=0.6; got none")
         names = self._names(part)
-        hold = (hold,) if isinstance(hold, str) else tuple(hold)
+        if hold is not None:
+            hold = (hold,) if isinstance(hold, str) else tuple(hold)
         with self._lock:
             # parts of one material stay so: they are decoded once
             old = {name: self.material(name) for name in names}
@@ -720,7 +723,7 @@ class EditSession:
         self,
         old: Material,
         amounts: Mapping[str, float],
-        hold: Iterable[str],
+        hold: Iterable[str] | None,
         photoreal: bool = True,
     ) -> tuple[Material, Move]:
         found = self.traits.moved(old.z, amounts, hold, photoreal)
@@ -778,17 +781,14 @@ class EditSession:
                     "stroke: expected a stroke that touches the object, got one that lies beside "
                     f"it (image {scene.width} x {scene.height}, {len(stroke.points)} points)"
                 )
-            hold = stroke.hold
-            if hold is None:
-                hold = () if stroke.trait in GROUPS["colour"] else ("colour",)
-            hold = tuple(hold)
+            hold = None if stroke.hold is None else tuple(stroke.hold)
             found = {
                 name: self._moved(self.material(name), {stroke.trait: amount}, hold)
                 for name, amount in moved.items()
             }
             new = {name: material for name, (material, _) in found.items()}
             reached = {name: move for name, (_, move) in found.items()}
-            held = "" if stroke.hold is None else f", hold={hold!r}"
+            held = "" if hold is None else f", hold={hold!r}"
             alone = ""
             if only is not None:
                 alone = f", only={(only[0] if len(only) == 1 else only)!r}"
@@ -1644,11 +1644,11 @@ def _framing(scene: Scene) -> tuple[Camera, int, int]:
 def _move_call(
     part: str | list[str],
     amounts: Mapping[str, float],
-    hold: tuple[str, ...],
+    hold: tuple[str, ...] | None,
     photoreal: bool = True,
 ) -> str:
     said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
-    held = f", hold={hold!r}" if hold else ""
+    held = "" if hold is None else f", hold={hold!r}"
     freely = "" if photoreal else ", photoreal=False"
     return f"edit.move({part!r}{said}{held}{freely})"
 

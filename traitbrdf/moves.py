@@ -1,10 +1,10 @@
-"""Where moves of traits lead: numerics of a path through the embedding, compiled.
+"""Where moves of traits lead: a flow through the embedding.
 
-A move changes some scores by given amounts, exactly, and holds others. Among all ways to do so it
-takes the one that is most like what real materials do (shortest by a covariance of the library)
-and that changes other scores least, and keeps to where the library is. It goes in strides; in each,
-Newton's method brings the scores to where they shall be: a quadratic programme in the box, of which
-the rows are slopes of scores (Nocedal & Wright 2006, chapters 16 and 18).
+A move is the solution of dz/dt = v(z). The velocity v is the one that costs least: it is as short
+as can be in a covariance of the library, changes moved scores as fast as asked for, held ones not
+at all, and what had better stay, unrelated scores and the colours that a person sees, as little as
+can be. That is a quadratic programme in the box (Nocedal & Wright 2006, chapter 16), solved at each
+point alike: so a way is continuous, has no memory, and can be gone back.
 
 `Density`, `Grades` and `Readings` say where the library is and what scores are read off; `Ground`
 is all of it, as arrays, and `Task` one move.
@@ -24,27 +24,56 @@ from traitbrdf.descriptors import (
     DESCRIPTORS,
     LUMINANCE,
     READINGS,
-    above,
+    WHITE,
+    cielab,
     formulas,
-    opponents,
 )
-from traitbrdf.embedding import FLOOR
+from traitbrdf.embedding import FLOOR, OPPONENT
 
 Float64 = NDArray[np.float64]
 
-STRIDE = 0.5  # in scores: how far a move goes before it looks again
-_NUDGES = (0.15, 0.4, 0.7)  # shares of the way to a kind of material
-_TRIED = 4  # kinds of material
-_TURNS = 14  # of Newton's method in a stride
-_EXACT = 1e-5  # how near a score is brought
-_NEAR = 2e-3  # how near is near enough where a score has a kink
-_APART = 10.0  # what a change of unrelated scores costs, beside the metric
+STEP = 0.05  # in scores: how far a move goes before it looks again
+_APART = 2.0  # what a change of unrelated scores costs, beside the metric
 _BODY = 30.0  # what a change of the body costs, where it is kept
-_HUE = 10.0  # what a unit of a* or b* costs, where colour is held
-_TURN = 1.0  # degrees that hues may turn then
-_DEPENDENT = 1e-11  # of slopes: what differs by less is one and the same
-_ABSURD = 25.0  # standard deviations of a coordinate: no step is that long
+_STEER = 0.1  # what it costs to miss a unit of a* or b* of the colour that a move leads to
+_KEEN = 4.0  # shares of what is missing that are made up for in a unit
+_TURNING = 120.0  # colour difference for a unit: no faster
+_TINGED = 0.15  # log RGB: less is grey
+_HELD = 1e6  # what a change of a held score costs
+_WANTED = 3000.0  # what it costs that a moved score stays behind
+_FULL = 0.7  # of the way asked for: from here on all of it is made
+_WALL = 1e5  # what it costs to go through a wall
+_BACK = 0.05  # the most that a step goes back to a wall that the last one went through
+_THIN = 0.1  # of log density, beside what decoding mends
+_MENDS = 4  # how often scores are put right after a step
+_EXACT = 1e-5  # how near a score is brought
+_OVER = 0.02  # log f by which a step may go through a wall
+_TRUST = 0.01  # how far a step's scores may be from what the field says
+_ASTRAY = 2e-3  # how far held scores may be from where they were
+_FALLS = 5e-4  # by which a moved score may fall in a part of a step
+_LOST = 0.02  # what is further off is no error of a step
+_SMOOTH = 0.12  # of a descriptor's range: over which its distribution is smoothed
+_POWER = 48  # of the norm that stands for the greatest albedo: smooth, and 5 % above at most
+_LONG = 0.25  # standard deviations: no part of a step is longer
+_PARTS = 16.0  # shorter than that part of a step it is never made
+_LOOKS = 48  # at the field, in a step
+_FASTEST = 20.0  # standard deviations for a unit
+_SHOWN = 150.0  # of the CIE 1976 colour difference for a unit
+_HARDLY = 1e-9  # less than this is no way at all
+_STUCK = 0.02  # of the way asked for: what makes less has ended
+_PATIENCE = 3  # steps that come to nothing before a move ends
 _SMALL = 1e-5  # a step along a coordinate that shows slopes
+
+
+# What is compiled are loops over arrays that are given, called from Python one by one: a compiled
+# function that calls others is compiled together with all of them, and takes as much longer. The
+# lock of Python is kept meanwhile: they take microseconds, and getting it back can take more.
+_compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+
+
+def _plain(array: Any) -> Any:
+    """A copy that can be written to, of one layout: for each other one, code is compiled anew."""
+    return np.array(array, np.int64 if array.dtype.kind == "i" else np.float64, order="C")
 
 
 class Density(NamedTuple):
@@ -90,32 +119,41 @@ class Density(NamedTuple):
 
     def slope(self, z: Float64) -> tuple[float, Float64]:
         """log density at z (k,) and its gradient (k,)."""
-        found = _log_density(np.ascontiguousarray(z, np.float64), *self[:3])
-        return float(found[0]), np.asarray(found[1])
+        uphill = np.zeros(len(z))
+        pulls, each = np.empty(self.means.shape), np.empty(len(self.means))
+        found = _log_density(_plain(z), self.means, self.whiten, self.logs, pulls, each, uphill)
+        return float(found), uphill
 
 
-@numba.njit(cache=True, nogil=True)
-def _log_density(z: Any, means: Any, whiten: Any, logs: Any) -> Any:
-    """log density at z (k,), and its gradient (k,)."""
+@_compiled
+def _log_density(
+    z: Any, means: Any, whiten: Any, logs: Any, pulls: Any, each: Any, uphill: Any
+) -> Any:
+    """log density at z (k,); its gradient is added to `uphill` (k,). `pulls` (c, k) and `each` (c,)
+    are room to reckon in."""
     count, k = means.shape
-    each, pulls = np.empty(count), np.zeros((count, k))
+    top = -math.inf
     for c in range(count):
         square = 0.0
         for i in range(k):
             away = 0.0
             for j in range(i + 1):
                 away += whiten[c, i, j] * (z[j] - means[c, j])
+            pulls[c, i] = away
             square += away * away
-            for j in range(i + 1):
-                pulls[c, j] += away * whiten[c, i, j]
         each[c] = logs[c] - 0.5 * square
-    top = each.max()
-    total, slope = 0.0, np.zeros(k)
+        top = max(top, each[c])
+    total = 0.0
     for c in range(count):
-        share = math.exp(each[c] - top)
-        total += share
-        slope -= share * pulls[c]
-    return top + math.log(total), slope / total
+        each[c] = math.exp(each[c] - top)
+        total += each[c]
+    for c in range(count):
+        share = each[c] / total
+        if share > 1e-20:  # less than that is lost in rounding
+            for i in range(k):
+                for j in range(i + 1):
+                    uphill[j] -= share * pulls[c, i] * whiten[c, i, j]
+    return top + math.log(total)
 
 
 class Grades(NamedTuple):
@@ -132,35 +170,31 @@ class Grades(NamedTuple):
     grade: Float64
 
     @classmethod
-    def fit(cls, values: Mapping[str, ArrayLike], knots: int = 65) -> Grades:
-        from scipy.interpolate import PchipInterpolator
-        from scipy.special import ndtri
+    def fit(cls, values: Mapping[str, ArrayLike], knots: int = 129) -> Grades:
+        """Normal scores of smoothed distributions (kernel estimates, Silverman 1986, chapter 2).
 
-        share = np.linspace(0.02, 0.98, 17)
+        Smoothed, since many members share a value (no tint at all): as steep as a step there, a
+        trait would leap.
+        """
+        from scipy.special import ndtr, ndtri
+
         at, grade = [], []
         for column in values.values():
-            x = np.quantile(np.asarray(column, np.float64), share)
-            # many members share a value (no tint at all): their grades are one
-            gap = 0.03 * max(float(x[-2] - x[1]), 1e-6)
-            place = np.unique(np.floor((x - x[0]) / gap), return_inverse=True)[1]
-            count = np.bincount(place)
-            kept = np.bincount(place, x) / count
-            level = np.bincount(place, ndtri(share)) / count
-            if len(kept) == 1:
-                kept, level = np.append(kept, kept + gap), np.append(level, level + 0.1)
-            even = np.linspace(kept[0], kept[-1], knots)
-            between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, len(kept)), kept)
-            fine = 0.5 * (even + between)
+            x = np.asarray(column, np.float64)
+            low, high = np.quantile(x, [0.02, 0.98])
+            wide = _SMOOTH * max(float(high - low), 1e-6)
+            fine = np.linspace(low - wide, high + wide, knots)
             at.append(fine)
-            grade.append(PchipInterpolator(kept, level)(fine))
+            grade.append(ndtri(np.mean(ndtr((fine[:, None] - x) / wide), axis=1)))
         return cls(tuple(values), np.array(at), np.array(grade))
 
     def of(self, descriptors: Float64) -> Float64:
         """Grades (..., d) of all of `descriptors.DESCRIPTORS` (..., n), in their order."""
         used = _places(self.names)
-        flat = np.ascontiguousarray(descriptors.reshape(-1, descriptors.shape[-1]))
-        found = _interpolated(flat, used, self.at, self.grade)
-        return np.asarray(found).reshape(*descriptors.shape[:-1], len(used))
+        flat = np.ascontiguousarray(descriptors.reshape(-1, descriptors.shape[-1]), np.float64)
+        found = np.empty((len(flat), len(used)))
+        _interpolate(flat, used, self.at, self.grade, found)
+        return found.reshape(*descriptors.shape[:-1], len(used))
 
 
 _ORDER = {name: i for i, name in enumerate(DESCRIPTORS)}
@@ -171,26 +205,29 @@ def _places(names: Sequence[str]) -> NDArray[np.int64]:
     return np.array([_ORDER[name] for name in names], np.int64)
 
 
-@numba.njit(cache=True, nogil=True)
-def _interpolated(values: Any, used: Any, at: Any, grade: Any) -> Any:
+@_compiled
+def _interpolate(values: Any, used: Any, at: Any, grade: Any, out: Any) -> Any:
     """Columns `used` of values (m, n), each along its own knots, and straight on beyond them."""
-    out = np.empty((len(values), len(used)))
     last = at.shape[1] - 1
+    end = max(last // 8, 1)
     for j in range(len(used)):
-        x, y = at[j], grade[j]
-        end = max(last // 8, 1)
-        below = (y[end] - y[0]) / (x[end] - x[0])
-        above = (y[last] - y[last - end]) / (x[last] - x[last - end])
+        below = (grade[j, end] - grade[j, 0]) / (at[j, end] - at[j, 0])
+        above = (grade[j, last] - grade[j, last - end]) / (at[j, last] - at[j, last - end])
         for m in range(len(values)):
             v = values[m, used[j]]
-            if v <= x[0]:
-                out[m, j] = y[0] + below * (v - x[0])
-            elif v >= x[last]:
-                out[m, j] = y[last] + above * (v - x[last])
-            else:
-                i = min(max(np.searchsorted(x, v, side="right") - 1, 0), last - 1)
-                out[m, j] = y[i] + (y[i + 1] - y[i]) * (v - x[i]) / (x[i + 1] - x[i])
-    return out
+            i, steep = 0, below
+            if v >= at[j, last]:
+                i, steep = last, above
+            elif v > at[j, 0]:
+                after = last  # the knot at or before v, by halving
+                while after - i > 1:
+                    middle = (i + after) // 2
+                    if v < at[j, middle]:
+                        after = middle
+                    else:
+                        i = middle
+                steep = (grade[j, after] - grade[j, i]) / (at[j, after] - at[j, i])
+            out[m, j] = grade[j, i] + steep * (v - at[j, i])
 
 
 class Readings(NamedTuple):
@@ -215,30 +252,125 @@ class Readings(NamedTuple):
 
     def at(self, z: Float64) -> Float64:
         """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
-        points = np.ascontiguousarray(z, np.float64).reshape(-1, z.shape[-1])
-        found = [_near(point, *self, False)[0] for point in points]
+        points = _plain(z).reshape(-1, z.shape[-1])
+        cells = _Cells.of(self)
+        found = [cells.near(point, False)[0] for point in points]
         return np.reshape(found, (*z.shape[:-1], len(self.weights), 3))
 
 
-@numba.njit(cache=True, nogil=True)
+class _Cells(NamedTuple):
+    """`Readings` without the zeros, and the albedos after them as readings more.
+
+    Parameters
+    ----------
+    rows, mean, columns : as `Readings`
+    turned : (3, k, cells) of `OPPONENT` axes in the place of channels, where most are zeros
+    spans : (3, 2), the coordinates that each axis depends on: from and to
+    starts : (readings + angles + 1,) where the cells of each begin in the others
+    which, weights : (n,) each, cells and what they weigh
+    angles : int64
+    """
+
+    rows: Float64
+    mean: Float64
+    columns: NDArray[np.int64]
+    turned: Float64
+    spans: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    which: NDArray[np.int64]
+    weights: Float64
+    angles: int
+
+    @classmethod
+    def of(cls, readings: Readings) -> _Cells:
+        dense = np.concatenate([readings.weights, readings.energy])
+        of, which = np.nonzero(dense)
+        starts = np.searchsorted(of, np.arange(len(dense) + 1))
+        turned = np.einsum("ac,cnk->akn", OPPONENT, readings.rows)
+        some = [np.flatnonzero(np.any(np.abs(axis) > 1e-12, axis=1)) for axis in turned]
+        spans = np.array([(found[0], found[-1] + 1) if len(found) else (0, 0) for found in some])
+        return cls(
+            _plain(readings.rows),
+            _plain(readings.mean),
+            _plain(readings.columns),
+            _plain(turned),
+            spans,
+            starts, which, dense[of, which],
+            len(readings.energy),
+        )  # fmt: skip
+
+    def near(self, z: Float64, sloped: bool) -> tuple[Float64, Float64, Float64, Float64]:
+        """Readings (readings, 3) at a point (k,) and their slopes (readings, 3, k); what decoding
+        mends there (2,) and its slopes (2, k): by how much (log f) the middle of the highlight is
+        darker than what is around it, and the log of the greatest albedo. No slopes are zeros."""
+        count, k = len(self.starts) - 1, len(z)
+        value, slopes = np.zeros((count, 3)), np.zeros((count if sloped else 0, 3, k))
+        mended, steep = np.zeros(2), np.zeros((2, k))
+        raised = np.empty((3, len(self.mean)))
+        source = np.empty(raised.shape, np.int64)
+        _near(z, self, raised, source, value, slopes, mended, steep)
+        return value[: count - self.angles], slopes[: count - self.angles], mended, steep
+
+
+@_compiled
 def _near(
-    z: Any, rows: Any, mean: Any, weights: Any, columns: Any, outer: Any, energy: Any, sloped: Any
+    z: Any,
+    cells: Any,
+    raised: Any,
+    source: Any,
+    value: Any,
+    slopes: Any,
+    mended: Any,
+    steep: Any,
 ) -> Any:
-    """Readings (readings, 3) at a point and their slopes (readings, 3, k), 0 if they are not
-    wanted; what decoding mends there (2,) and its slopes (2, k): by how much (log f) the middle of
-    the highlight is darker than what is around it, and the log of the greatest albedo."""
-    count, cells = weights.shape
-    value, slopes = np.zeros((count, 3)), np.zeros((count, 3, len(z)))
-    mended, steep = np.zeros(2), np.zeros((2, len(z)))
-    raised, source = np.empty((3, cells)), np.empty((3, cells), np.int64)
-    for c in range(3):
-        for n in range(cells):
-            log = mean[n]
-            for k in range(len(z)):
-                log += rows[c, n, k] * z[k]
-            raised[c, n] = math.exp(min(log, 30.0))
+    """Add up what `_Cells.near` gives, of readings and albedos; slopes if there is room for them.
+    `raised` and `source` (3, cells) become f + FLOOR, and the cells of which it is."""
+    rows, columns = cells.rows, cells.columns
+    k, count, first = len(z), len(value), len(value) - cells.angles
+    for a in range(3):
+        for n in range(len(cells.mean)):
+            raised[a, n] = 0.0
+        for j in range(cells.spans[a, 0], cells.spans[a, 1]):
+            for n in range(len(cells.mean)):
+                raised[a, n] += z[j] * cells.turned[a, j, n]
+    for n in range(len(cells.mean)):
+        x, y, w = raised[0, n], raised[1, n], raised[2, n]
+        for c in range(3):
+            log = cells.mean[n] + OPPONENT[0, c] * x + OPPONENT[1, c] * y + OPPONENT[2, c] * w
+            # exp as 64th power of its series: a library's is called for each cell alone, which
+            # was most of the work
+            t = min(log, 30.0) / 64.0
+            e = 1.0 + t * (1 / 11 + t * (1 / 132 + t * (1 / 1716)))
+            e = 1.0 + t * (1 / 8 + t * (1 / 72 + t * (1 / 720) * e))
+            e = 1.0 + t * (1 / 5 + t * (1 / 30 + t * (1 / 210) * e))
+            e = 1.0 + t * (1.0 + t * (1 / 2 + t * (1 / 6 + t * (1 / 24) * e)))
+            e *= e
+            e *= e
+            e *= e
+            e *= e
+            e *= e
+            raised[c, n] = e * e
             source[c, n] = n
-    mended[0], steep[0] = _hole(columns, outer, raised, rows, sloped)
+    # the middle of the profile is darker than its brightest by
+    brightest, most, middle = 0, 0.0, 0.0
+    for i in range(len(columns)):
+        light = 0.0
+        for j in range(columns.shape[1]):
+            for c in range(3):
+                light += LUMINANCE[c] * raised[c, columns[i, j]]
+        if i == 0:
+            middle = light
+        if light > most:
+            brightest, most = i, light
+    mended[0] = math.log(most / middle)
+    if len(slopes) > 0 and brightest > 0:
+        for j in range(columns.shape[1]):
+            for c in range(3):
+                bright, dark = columns[brightest, j], columns[0, j]
+                up = LUMINANCE[c] * raised[c, bright] / most
+                down = LUMINANCE[c] * raised[c, dark] / middle
+                for m in range(k):
+                    steep[0, m] += up * rows[c, bright, m] - down * rows[c, dark, m]
     # no hole in the highlight: as high as what follows, of which it then has the slope too
     for c in range(3):
         for j in range(columns.shape[1]):
@@ -247,132 +379,121 @@ def _near(
                 if raised[c, n] < raised[c, after]:
                     raised[c, n], source[c, n] = raised[c, after], source[c, after]
     for i in range(count):
-        for n in range(cells):
-            weight = weights[i, n]
-            if weight != 0.0:
-                for c in range(3):
-                    value[i, c] += weight * max(raised[c, n] - FLOOR, 0.0)
-                    if sloped:
-                        by, s = weight * raised[c, n], source[c, n]
-                        for k in range(len(z)):
-                            slopes[i, c, k] += by * rows[c, s, k]
-    whole, angle, colour = 1e-9, 0, 0
-    for i in range(len(energy)):
-        for c in range(3):
-            albedo = 0.0
-            for n in range(cells):
-                albedo += energy[i, n] * max(raised[c, n] - FLOOR, 0.0)
-            if albedo > whole:
-                whole, angle, colour = albedo, i, c
-    mended[1] = math.log(whole)
-    if sloped and len(energy):
-        for n in range(cells):
-            by = energy[angle, n] * raised[colour, n] / whole
-            if by != 0.0:
-                for k in range(len(z)):
-                    steep[1, k] += by * rows[colour, source[colour, n], k]
-    if whole > 1.0:  # no more light than there was
-        for i in range(count):
+        end = cells.starts[i + 1]
+        for p in range(cells.starts[i], end, 2):
+            # two at once: each pass through the slopes takes as long as what is added there
+            n, weight = cells.which[p], cells.weights[p]
+            two = min(p + 1, end - 1)
+            other, its_weight = cells.which[two], cells.weights[two] if p + 1 < end else 0.0
             for c in range(3):
-                for k in range(len(z)):
-                    slopes[i, c, k] = (slopes[i, c, k] - value[i, c] * steep[1, k]) / whole
-                value[i, c] /= whole
-    return value, slopes, mended, steep
-
-
-@numba.njit(cache=True, nogil=True)
-def _hole(columns: Any, outer: Any, raised: Any, rows: Any, sloped: Any) -> Any:
-    """By how much (log f) the middle of the profile is darker than its brightest, and the slope
-    (k,)."""
-    middle = most = _light_of(columns[0], raised)
-    brightest = columns[0]
-    for nodes in (columns, outer):
-        for i in range(len(nodes)):
-            light = _light_of(nodes[i], raised)
-            if light > most:
-                most, brightest = light, nodes[i]
-    inward = np.zeros(rows.shape[2])
-    if sloped:
-        for at, by in ((brightest, 1.0 / most), (columns[0], -1.0 / middle)):
-            for n in at:
-                for c in range(3):
-                    for k in range(len(inward)):
-                        inward[k] += by * LUMINANCE[c] * raised[c, n] * rows[c, n, k]
-    return math.log(most / middle), inward
-
-
-@numba.njit(cache=True, nogil=True)
-def _light_of(cells: Any, raised: Any) -> Any:
-    light = 0.0
-    for n in cells:
+                value[i, c] += weight * max(raised[c, n] - FLOOR, 0.0)
+                value[i, c] += its_weight * max(raised[c, other] - FLOOR, 0.0)
+                if len(slopes) > 0:
+                    by, s = weight * raised[c, n], source[c, n]
+                    its, t = its_weight * raised[c, other], source[c, other]
+                    for m in range(k):
+                        slopes[i, c, m] += by * rows[c, s, m] + its * rows[c, t, m]
+    whole, angle, colour, norm = 1e-9, first, 0, 0.0
+    for i in range(first, count):
         for c in range(3):
-            light += LUMINANCE[c] * raised[c, n]
-    return light
+            if value[i, c] > whole:
+                whole, angle, colour = value[i, c], i, c
+    for i in range(first, count):
+        for c in range(3):
+            norm += (value[i, c] / whole) ** _POWER
+    mended[1] = math.log(whole) + math.log(max(norm, 1.0)) / _POWER
+    if len(slopes) > 0:
+        for i in range(first, count):
+            for c in range(3):
+                part = (value[i, c] / whole) ** _POWER / norm
+                if part > 1e-3:
+                    for m in range(k):
+                        steep[1, m] += part / max(value[i, c], 1e-9) * slopes[i, c, m]
+    if whole > 1.0:  # no more light than there was
+        for i in range(first):
+            for c in range(3):
+                value[i, c] /= whole
+                if len(slopes) > 0:
+                    for m in range(k):
+                        top = slopes[angle, colour, m]
+                        slopes[i, c, m] = (slopes[i, c, m] - value[i, c] * top) / whole
 
 
 PALE = 5.0  # C*ab: paler colours have no hue to speak of
-_DARK = 0.003  # f of a body or lobe that has half a hue
 
-_BODY_AT, _PEAK_AT = READINGS.index("body"), READINGS.index("profile 0")
+SURFACES = ("albedo 10", "albedo", "albedo 60", "body", "side")
+"""Readings whose colour a person sees: all reflected light from three angles, the body, and the
+body lit from the side."""
+
+_BODY_OF = SURFACES.index("body")
+_PEAK_AT = READINGS.index("profile 0")
+_SEEN_AT = np.array([READINGS.index(name) for name in SURFACES])
+# the body is read as f, not as an albedo
+_WHOLE = np.array([[1.0], [1.0], [1.0], [math.pi], [math.pi]])
+
+# rows of what `_colour_rows` gives: slopes of L*, a* and b* of each surface; of each, what changes
+# its hue, what gives a hue to what is grey, and what changes its chroma beside lightness; what
+# changes the hue of the lobe; what changes L* of the body otherwise than that of all light
+_TURN, _HUES, _GREYS, _CHROMAS, _LOBES, _BESIDE, _COLOURS = 0, 15, 20, 30, 40, 43, 44
 
 
-def colours(readings: Float64) -> Float64:
-    """a* and b* (2, 2) of body and lobe, of readings (1, readings, 3); what is not seen is grey."""
-    found, seen = _colours(readings)
-    return np.asarray(found[0] * np.minimum(2.0 * seen[0], 1.0)[:, None])
-
-
-@numba.njit(cache=True, nogil=True)
-def _colours(readings: Any) -> Any:
-    """a* and b* (m, 2, 2) of body and lobe, this scaled to white, of readings (m, readings, 3), and
-    how much there is of both (m, 2): 0 nothing to see a hue of, 1 enough."""
-    found, seen = np.empty((len(readings), 2, 2)), np.empty((len(readings), 2))
-    rgb, light = np.empty((2, 3)), np.empty(2)
-    for m in range(len(readings)):
+@_compiled
+def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
+    """Fill in CIELAB (5, 3) of `SURFACES` and how it changes, functions (_COLOURS, k) of a
+    velocity, of readings (readings, 3) and their slopes (readings, 3, k)."""
+    k = by_z.shape[2]
+    f, by = np.empty(lab.shape[1]), np.empty(lab.shape[1])
+    for i in range(len(_SEEN_AT)):
+        at, whole = _SEEN_AT[i], _WHOLE[i, 0]
+        for j in range(3):
+            x = 1e-9
+            for c in range(3):
+                x += WHITE[j, c] * whole * max(readings[at, c], 0.0)
+            cube = x > (6 / 29) ** 3
+            f[j] = x ** (1 / 3) if cube else x * (29 / 6) ** 2 / 3 + 4 / 29
+            by[j] = whole * (f[j] / (3.0 * x) if cube else (29 / 6) ** 2 / 3)
+        light, a, b = 116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])
+        lab[i, 0], lab[i, 1], lab[i, 2] = light, a, b
+        chroma = a * a + b * b + PALE * PALE
+        degrees = 180.0 / math.pi / chroma  # fewer where there is hardly a hue
+        grey = 180.0 / math.pi * PALE * PALE / (chroma * math.sqrt(chroma))
+        for n in range(k):
+            red, green, blue = by_z[at, 0, n], by_z[at, 1, n], by_z[at, 2, n]
+            x = by[0] * (WHITE[0, 0] * red + WHITE[0, 1] * green + WHITE[0, 2] * blue)
+            y = by[1] * (WHITE[1, 0] * red + WHITE[1, 1] * green + WHITE[1, 2] * blue)
+            z = by[2] * (WHITE[2, 0] * red + WHITE[2, 1] * green + WHITE[2, 2] * blue)
+            by_light, by_a, by_b = 116.0 * y, 500.0 * (x - y), 200.0 * (y - z)
+            rows[_TURN + 3 * i, n] = by_light
+            rows[_TURN + 3 * i + 1, n] = by_a
+            rows[_TURN + 3 * i + 2, n] = by_b
+            rows[_HUES + i, n] = degrees * (a * by_b - b * by_a)
+            rows[_GREYS + 2 * i, n] = grey * by_a
+            rows[_GREYS + 2 * i + 1, n] = grey * by_b
+            # a colour that grows lighter keeps its ratio of a* to L* + 16
+            rows[_CHROMAS + 2 * i, n] = by_a - a / (light + 16.0) * by_light
+            rows[_CHROMAS + 2 * i + 1, n] = by_b - b / (light + 16.0) * by_light
+    # a lobe may take on the hue of all light, or lose it, but gets no other. Hues are logarithms
+    # of red over blue and of green over both
+    x = y = along_x = along_y = 0.0
+    for c in range(3):
+        log = math.log(max(readings[_SEEN_AT[1], c], 0.0) + 1e-2)
+        x += OPPONENT[1, c] * log
+        y += OPPONENT[2, c] * log
+        by[c] = 1.0 / (max(readings[_PEAK_AT, c], 0.0) + 1e-2)
+        along_x -= OPPONENT[1, c] * math.log(by[c])
+        along_y -= OPPONENT[2, c] * math.log(by[c])
+    size = math.sqrt(x * x + y * y + _TINGED * _TINGED)
+    along = (along_x * x + along_y * y) / size
+    grey = max(_TINGED / size, 1.0 / (1.0 + math.exp(min(along / 0.02, 50.0))))
+    for n in range(k):
+        by_x = by_y = 0.0
         for c in range(3):
-            rgb[0, c] = max(readings[m, _BODY_AT, c], 0.0) + 1e-6
-            rgb[1, c] = above(max(readings[m, _PEAK_AT, c], 0.0), rgb[0, c], 1e-3) + 1e-6
-        for i in range(2):
-            light[i] = 0.0
-            for c in range(3):
-                light[i] += LUMINANCE[c] * rgb[i, c]
-            whole = max(rgb[1, 0], rgb[1, 1], rgb[1, 2]) if i else 1.0 / math.pi
-            for c in range(3):
-                rgb[i, c] /= whole
-            found[m, i] = opponents(rgb[i])
-        seen[m, 0] = light[0] / (light[0] + _DARK)
-        # never quite nothing, so that slopes tell what colour a lobe will have once it is seen
-        seen[m, 1] = light[1] / (light[1] + _DARK + 0.5 * light[0])
-    return found, seen
-
-
-@numba.njit(cache=True, nogil=True)
-def _turned(kept: Any, found: Any, seen: Any) -> Any:
-    """Of `_colours` (2, 2) what shall stay 0 (4,): a* and b* across the kept hues (2, 2), and along
-    them for what is pale."""
-    out = np.empty(4)
-    for i in range(2):
-        chroma = math.hypot(kept[i, 0], kept[i, 1])
-        x, y = (kept[i, 0] / chroma, kept[i, 1] / chroma) if chroma > 0.0 else (1.0, 0.0)
-        ahead = found[i, 0] * x + found[i, 1] * y - chroma
-        pale = min(max(1.0 - chroma / (2.0 * PALE), 0.0), 1.0)
-        # a colour that fades stops short of turning into its opposite
-        faded = min(ahead + 0.6 * chroma, 0.0)
-        out[i] = seen[i] * (found[i, 1] * x - found[i, 0] * y)
-        out[2 + i] = seen[i] * (pale * ahead + faded)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _off(kept: Any, found: Any, seen: Any) -> Any:
-    """By how many degrees hues of `_colours` (2, 2) are off, as far as there are hues."""
-    worst = 0.0
-    for i in range(2):
-        now, then = complex(found[i, 0], found[i, 1]), complex(kept[i, 0], kept[i, 1])
-        sure = min(min(abs(now), abs(then)) / PALE, 1.0) * min(2.0 * seen[i], 1.0)
-        turn = then * now.conjugate()
-        worst = max(worst, sure * abs(math.degrees(math.atan2(turn.imag, turn.real))))
-    return worst
+            by_x += OPPONENT[1, c] * by_z[_PEAK_AT, c, n] * by[c]
+            by_y += OPPONENT[2, c] * by_z[_PEAK_AT, c, n] * by[c]
+        rows[_LOBES, n] = (x * by_y - y * by_x) / size
+        rows[_LOBES + 1, n] = grey * by_x
+        rows[_LOBES + 2, n] = grey * by_y
+        rows[_BESIDE, n] = rows[3 * _BODY_OF, n] - rows[3, n]
 
 
 class Optics(NamedTuple):
@@ -382,44 +503,52 @@ class Optics(NamedTuple):
     grades: Grades
 
 
-class Ground(NamedTuple):
-    """What scores and their slopes are had of, as arrays.
+class Around(NamedTuple):
+    """What moves need to know of a point.
 
     Parameters
     ----------
-    read : whether scores are read off descriptors; if not, readings and grades are not looked at
-    rows, mean, cells, columns, outer, energy : as `Readings`
-    used : (d,) places of the graded descriptors among all
-    at, grade : as `Grades`
-    weights, normals : (t, d) and (t, k), raw scores: weights @ grades + normals @ z
-    zero, span : (t,), raw scores of score 0, and between scores 0 and 1
-    stiffness : (k, k) metric of moves
-    low, high : (k,)
-    means, whiten, logs : as `Density`; without one, there are none
-    kinds : (c, t) scores at the means of the c families
+    score, slopes : (t,) and (t, k)
+    lab : (5, 3) CIELAB of `SURFACES`
+    colours : (_COLOURS, k), how colours change, as `_colour_rows`
+    mended, steep : (2,) and (2, k), what decoding mends and its slopes, as `_Cells.near`
+    likely, uphill : log density and its gradient (k,), zeros without one
     """
 
-    read: bool
-    rows: Float64
-    mean: Float64
-    cells: Float64
-    columns: NDArray[np.int64]
-    outer: NDArray[np.int64]
-    energy: Float64
+    score: Float64
+    slopes: Float64
+    lab: Float64
+    colours: Float64
+    mended: Float64
+    steep: Float64
+    likely: float
+    uphill: Float64
+
+
+class Ground(NamedTuple):
+    """What scores and their slopes are had of.
+
+    Parameters
+    ----------
+    cells : None if scores are not read off descriptors
+    used : (d,) places of the graded descriptors among all
+    grades : as `Grades`
+    weights, normals, zero : (t, d), (t, k) and (t,), scores: weights @ grades + normals @ z - zero
+    stiffness : (k, k) metric of moves
+    low, high : (k,)
+    density : None if it is not known where the library is
+    """
+
+    cells: _Cells | None
     used: NDArray[np.int64]
-    at: Float64
-    grade: Float64
+    grades: Grades
     weights: Float64
     normals: Float64
     zero: Float64
-    span: Float64
     stiffness: Float64
     low: Float64
     high: Float64
-    means: Float64
-    whiten: Float64
-    logs: Float64
-    kinds: Float64
+    density: Density | None
 
     @classmethod
     def of(
@@ -434,458 +563,519 @@ class Ground(NamedTuple):
         high: Float64,
         density: Density | None,
     ) -> Ground:
-        k = len(low)
-        none, no_cells = np.zeros((0, 0)), np.zeros((0, 0), np.int64)
-        readings, grades = optics or (
-            Readings(np.zeros((3, 0, k)), np.zeros(0), none, no_cells, no_cells, none),
-            Grades((), none, none),
+        """`weights` and `normals` give raw scores, `zero` (t,) is that of score 0, and `span` (t,)
+        what lies between scores 0 and 1."""
+        none = np.zeros((0, 0))
+        names, at, grade = optics.grades if optics else ((), none, none)
+        return cls(
+            _Cells.of(optics.readings) if optics else None,
+            _places(names),
+            Grades(names, _plain(at), _plain(grade)),
+            _plain(weights / span[:, None]),
+            _plain(normals / span[:, None]),
+            zero / span,
+            _plain(stiffness),
+            low,
+            high,
+            density and Density(*map(_plain, density)),
         )
-        where = density or Density(np.zeros((0, k)), np.zeros((0, k, k)), np.zeros(0), np.zeros(0))
-        some = [
-            *readings, _places(grades.names), grades.at,
-            grades.grade, weights, normals, zero, span, stiffness, low, high, where.means,
-            where.whiten, where.logs, np.zeros((0, len(span))),
-        ]  # fmt: skip
-        # of one layout: each other one would be compiled anew
-        found: list[Any] = [np.array(array, order="C") for array in some]
-        ground = cls(optics is not None, *found)
-        families = [np.clip(mean, low, high) for mean in where.means[:-1]]
-        if not families:
-            return ground
-        return ground._replace(kinds=np.array([ground.look(z)[0] for z in families]))
+
+    def seen(self, z: Float64) -> Float64:
+        """CIELAB (5, 3) of `SURFACES` at z (k,)."""
+        return cielab(self.look(z)[1][_SEEN_AT] * _WHOLE)
+
+    def slopes(self, z: Float64) -> Float64:
+        """Slopes (t, k) of all scores at z (k,)."""
+        return self.around(z).slopes
 
     def look(self, z: Float64) -> tuple[Float64, Float64, Float64]:
-        """Scores (t,) at z (k,), readings (1, readings, 3) and what decoding mends (2,), as
-        `_near`; zeros where nothing is read."""
-        score, readings, mended = _look(self, np.ascontiguousarray(z, np.float64))
+        """Scores (t,) at z (k,), readings (readings, 3) and what decoding mends (2,), as
+        `_Cells.near`; zeros where nothing is read."""
+        score = self.normals @ z - self.zero
+        if self.cells is None:
+            return score, np.zeros((len(READINGS), 3)), np.zeros(2)
+        readings, _, mended, _ = self.cells.near(_plain(z), False)
+        score += self.weights @ self._graded(readings[None])[0]
         return score, readings, mended
 
+    def around(self, z: Float64) -> Around:
+        """What there is to know at z (k,)."""
+        k, point = len(z), _plain(z)
+        score, slopes = self.normals @ point - self.zero, self.normals
+        lab, colours = np.zeros((len(_SEEN_AT), 3)), np.zeros((_COLOURS, k))
+        mended, steep = np.zeros(2), np.zeros((2, k))
+        likely, uphill = self.density.slope(point) if self.density else (0.0, np.zeros(k))
+        if self.cells is not None:
+            readings, by_z, mended, steep = self.cells.near(point, True)
+            # formulas of a few numbers: cheaper once more than their slopes
+            steps = np.empty((k + 1, len(READINGS), 3))
+            steps[0] = 0.0
+            steps[1:] = by_z.transpose(2, 0, 1)
+            steps *= _SMALL
+            steps += readings
+            graded = self.weights @ self._graded(steps).T
+            score += graded[:, 0]
+            slopes = graded[:, 1:] - graded[:, :1]
+            slopes *= 1.0 / _SMALL
+            slopes += self.normals
+            _colour_rows(readings, by_z, lab, colours)
+        return Around(score, slopes, lab, colours, mended, steep, likely, uphill)
 
-@numba.njit(cache=True, nogil=True)
-def _read(ground: Any, z: Any, sloped: Any) -> Any:
-    return _near(
-        z,
-        ground.rows,
-        ground.mean,
-        ground.cells,
-        ground.columns,
-        ground.outer,
-        ground.energy,
-        sloped,
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def _look(ground: Any, z: Any) -> Any:
-    score, readings = _dots(ground.normals, z), np.zeros((1, len(READINGS), 3))
-    mended = np.zeros(2)
-    if ground.read:
-        near = _read(ground, z, False)
-        readings, mended = np.expand_dims(near[0], 0), near[2]
-        grades = _interpolated(formulas(readings), ground.used, ground.at, ground.grade)
-        for i in range(len(score)):
-            for j in range(grades.shape[1]):
-                score[i] += ground.weights[i, j] * grades[0, j]
-    for i in range(len(score)):
-        score[i] = (score[i] - ground.zero[i]) / ground.span[i]
-    return score, readings, mended
-
-
-@numba.njit(cache=True, nogil=True)
-def _dots(rows: Any, z: Any) -> Any:
-    """rows (n, k) @ z (k,)."""
-    out = np.zeros(len(rows))
-    for i in range(len(rows)):
-        for k in range(len(z)):
-            out[i] += rows[i, k] * z[k]
-    return out
+    def _graded(self, readings: Float64) -> Float64:
+        """Grades (m, d) of readings (m, readings, 3)."""
+        described = np.empty((len(readings), len(DESCRIPTORS)))
+        formulas(readings, described)
+        found = np.empty((len(readings), len(self.used)))
+        _interpolate(described, self.used, self.grades.at, self.grades.grade, found)
+        return found
 
 
 class Task(NamedTuple):
-    """One move: scores to bring to where they shall be, and what shall stay.
+    """One move: what changes, what stays, and what had better stay.
 
     Parameters
     ----------
-    fixed : scores that are moved or held
-    rates : how they change along the move
-    start : what they were
-    soft, soft_start : scores that had better stay, and what they were
-    body, body_at : linear functions of the coordinates that stay, and what they were
-    kept, kept_at : those that had better stay
-    hued, hues : whether hues stay, and a* and b* (2, 2) of body and lobe
-    strictly_hued : whether no move may turn them
-    least : log density, `-inf` if it does not matter
+    moved : (n,) scores that change
+    rates : (n,) how fast, for each unit of the way
+    held : scores that stay
+    apart : scores that had better stay
+    hue, chroma, light : (5,) each
+        What it costs that the colours of `SURFACES` change: a degree of hue, a unit of a* or b*
+        beside what lightness brings with it, a unit of L*.
+    steered : whether the move leads towards a colour, and `steer` (3,), its L*, and its a* and b*
+        for an L* + 16 of one
+    lobe : what it costs that the lobe gets a hue that all light has not, for log RGB
+    together : what it costs that L* of the body changes otherwise than that of all light
+    body : linear functions of the coordinates that say how the body looks, which stay
+    least : log density that no move goes below; `-inf` if it does not matter
     mended : (2,) the most that decoding may mend, as `_near`
-    back : how much of what had better stay is drawn back to where it was
-    strict : whether a stride is given up early
     """
 
-    fixed: NDArray[np.int64]
+    moved: NDArray[np.int64]
     rates: Float64
-    start: Float64
-    soft: NDArray[np.int64]
-    soft_start: Float64
+    held: NDArray[np.int64]
+    apart: NDArray[np.int64]
+    hue: Float64
+    chroma: Float64
+    light: Float64
+    steered: bool
+    steer: Float64
+    lobe: float
+    together: float
     body: Float64
-    body_at: Float64
-    kept: Float64
-    kept_at: Float64
-    hued: bool
-    hues: Float64
-    strictly_hued: bool
     least: float
     mended: Float64
-    back: float = 1.0
-    strict: bool = True
+    wanted: float = _WANTED
+    full: float = _FULL
+    apart_cost: float = _APART
 
-    def relaxed(self) -> list[Task]:
-        """This task with what it keeps held, drawn back, and left to itself."""
-        free = self._replace(back=0.0, strict=False)
-        if not len(self.kept):
-            return [self, free]
-        held = self._replace(
-            body=np.vstack([self.body, self.kept]),
-            body_at=np.append(self.body_at, self.kept_at),
-            kept=self.kept[:0],
-            kept_at=self.kept_at[:0],
-        )
-        return [held, self, free]
+    def colour_costs(self, coloured: bool) -> Float64:
+        """What changes (_COLOURS,) of `_colour_rows` cost; if not `coloured`, hues may change."""
+        costs = np.zeros(_COLOURS)
+        turn = costs[_TURN:_HUES].reshape(-1, 3)
+        turn[:, 0] = self.light
+        if self.steered:
+            turn[:, 1:] = _STEER
+            turn[:_BODY_OF, 0] += _STEER
+        if coloured:
+            costs[_HUES:_GREYS] = self.hue
+            costs[_GREYS:_CHROMAS] = self.hue.repeat(2)
+            costs[_CHROMAS:_LOBES] = self.chroma.repeat(2)
+            costs[_LOBES:_BESIDE] = self.lobe
+        costs[_BESIDE] = self.together
+        return costs
+
+    def score_costs(self, count: int) -> Float64:
+        """What it costs that scores (count,) change, or that moved ones change otherwise."""
+        costs = np.zeros(count)
+        costs[self.apart] = self.apart_cost
+        costs[self.held] = _HELD
+        costs[self.moved] = self.wanted
+        return costs
+
+    def drawn(self, lab: Float64, turn: Float64) -> Float64:
+        """What draws (k,) colours (5, 3), of which slopes (15, k) are known, to the one that a move
+        leads to: by a share of what is missing, and no faster than can be followed."""
+        if not self.steered:
+            return np.zeros(turn.shape[1])
+        missing = self.steer * (lab[:, :1] + 16.0) - lab
+        missing[:, 0] = np.where(np.arange(len(lab)) < _BODY_OF, self.steer[0] - lab[:, 0], 0.0)
+        far = np.sqrt(np.sum(missing * missing, axis=1, keepdims=True))
+        fast = _STEER * _KEEN / (1.0 + _KEEN * far / _TURNING)
+        return np.asarray(self.rates[0] * ((fast * missing).ravel() @ turn))
 
 
-def follow(ground: Ground, task: Task, z: Float64, end: float) -> tuple[Float64, float]:
-    """Along a move from z (k,) as far as `end` of its rates; where it came to, and how far.
+@_compiled
+def _stiffen(form: Any, scores: Any, by_score: Any, colours: Any, by_colour: Any) -> Any:
+    """Add squares of functions (n, k), each by what it costs (n,), to a quadratic form (k, k)."""
+    k = len(form)
+    for which in range(2):
+        rows, by = (scores, by_score) if which == 0 else (colours, by_colour)
+        for r in range(len(rows)):
+            if by[r] != 0.0:
+                for i in range(k):
+                    some = by[r] * rows[r, i]
+                    for j in range(k):
+                        form[i, j] += some * rows[r, j]
 
-    First all that had better stay does; where that ends, less and less of it. Where no path leads
-    on at all (slopes are none where there is no lobe yet), it starts anew a little nearer to kinds
-    of material that have more of what is asked.
+
+@_compiled
+def _least(stiff: Any, pull: Any, low: Any, high: Any, x: Any) -> Any:
+    """x (k,) within low and high becomes what makes x @ stiff @ x / 2 - pull @ x least.
+
+    Coordinates that would leave the box stay at its wall, and are not freed again.
     """
-    at, way = np.clip(z, ground.low, ground.high), 0.0
-    relaxed = task.relaxed()
-    for more in relaxed:
-        at, way = _path(ground, more, at, way, end)
-    anew = relaxed[-1]._replace(strictly_hued=task.hued)  # of those kinds all but the colour
-    for share in _NUDGES:
-        if way >= end:
-            break
-        for kind in _kinds(ground, task, at):
-            goal = _next_mark(way, 0.5 * STRIDE, end)
-            nearer = np.clip(at + share * (kind - at), ground.low, ground.high)
-            fits, found = _towards(ground, anew, nearer, goal, goal == end)
-            if fits:
-                at, way = _path(ground, anew, found, goal, end)
-                break
-    return at, float(way)
-
-
-def _kinds(ground: Ground, task: Task, z: Float64) -> Float64:
-    """The kinds of material (n, k) with the most of what is asked for the least way from z."""
-    moved = task.rates != 0.0
-    have = ground.kinds[:, task.fixed[moved]] - ground.look(z)[0][task.fixed[moved]]
-    away = ground.means[: len(have)] - z
-    far = np.sqrt(np.einsum("nk,kl,nl->n", away, ground.stiffness, away))
-    gain = have @ task.rates[moved] / np.maximum(far, 1e-9)
-    best = np.argsort(-gain, kind="stable")[:_TRIED]
-    nearest: Float64 = ground.means[best[gain[best] > 0.0]]
-    return nearest
-
-
-def possible(ground: Ground, task: Task, z: Float64) -> bool:
-    """Whether a small step from z (k,) would be, were there no gamut."""
-    missing, rows, stiff = _linear(ground, task, z, STRIDE)
-    far = np.full(len(z), np.inf)
-    return bool(_step(stiff, rows, missing, -far, far, z, np.zeros(len(z)))[0])
-
-
-def compromise(ground: Ground, task: Task, z: Float64, way: float) -> Float64:
-    """Where all that cannot be had together gives way alike."""
-    missing, rows, stiff = _linear(ground, task, z, way)
-    step = np.linalg.solve(1e-2 * stiff + rows.T @ rows, rows.T @ missing)
-    clipped: Float64 = np.clip(z + step, ground.low, ground.high)
-    return clipped
-
-
-def _linear(ground: Ground, task: Task, z: Float64, way: float) -> tuple[Float64, Float64, Float64]:
-    """What is missing (m,) of the way from z, rows (m, k), and the stiffness (k, k)."""
-    score, readings, _ = ground.look(z)
-    missing = _missing(task, z, way, score, readings)[0]
-    slopes, hues, stiff, _ = _around(ground, task, z)
-    rows, _ = _rows(task, z, score, readings, slopes, hues)
-    return missing[:-3], rows[:-3], stiff
-
-
-def _path(ground: Ground, task: Task, at: Float64, way: float, end: float) -> tuple[Float64, float]:
-    """`follow` of one task alone, from where scores have changed by `way` of the rates."""
-    stride, least = (STRIDE, 0.2 * STRIDE) if task.strict else (0.5 * STRIDE, 0.05 * STRIDE)
-    while way < end and stride > least:
-        goal = _next_mark(way, stride, end)
-        fits, z = _towards(ground, task, at, goal, goal == end)
-        if fits:
-            at, way, stride = z, goal, min(2.0 * stride, STRIDE)
-        else:
-            stride *= 0.25 if task.strict else 0.5
-    if 0.0 < way < end:  # a step on the way is not as exact as the last
-        fits, z = _towards(ground, task, at, way, True)
-        at = z if fits else at
-    return at, way
-
-
-def _next_mark(way: float, stride: float, end: float) -> float:
-    """Where a stride ends: at marks, so that moves by more and by less share their way."""
-    return min(stride * (math.floor(way / stride + 1e-9) + 1.0), end)
-
-
-@numba.njit(cache=True, nogil=True)
-def _towards(ground: Any, task: Any, start: Any, way: Any, last: Any) -> Any:
-    """From a point to where scores have changed by `way` of the rates, exactly in the `last` step;
-    whether that can be, and where.
-
-    All that is called stands once: each call is compiled in its place.
-    """
-    z = start.copy()
-    before, first = math.inf, math.inf
-    sloped = thinned = False
-    at_wall = np.zeros(2, np.bool_)
-    from_here, step, uphill = z.copy(), np.zeros(len(z)), np.zeros(len(z))
-    none = np.zeros((0, 0))
-    slopes, hues, stiff, steep = none, none, none, none
-    for turn in range(_TURNS):
-        score, readings, mended = _look(ground, z)
-        missing, miss, off = _missing(task, z, way, score, readings)
-        thin = 0.0
-        if task.least > -math.inf:
-            found, uphill = _log_density(z, ground.means, ground.whiten, ground.logs)
-            thin = task.least - found
-        broken = max(mended[0] - task.mended[0], mended[1] - task.mended[1])
-        enough = _EXACT if last and turn < _TURNS - 3 else _NEAR
-        if miss <= enough and thin <= 1e-3 and broken <= 0.03 and off <= _TURN and turn > 0:
-            return True, z
-        merit = miss + max(broken, 0.0) + 0.1 * max(thin, 0.0)
-        if turn == 5 and merit > 0.5 * first:
-            return False, z  # it leads nowhere
-        first = merit if turn == 0 else first
-        if merit > 1.2 * before and turn > 1:  # too far: half of it
-            sloped = False
-            for k in range(len(z)):
-                step[k] *= 0.5
-        else:
-            # slopes are kept as long as they lead there
-            if not sloped or merit > 0.3 * before:
-                slopes, hues, stiff, steep = _around(ground, task, z)
-                sloped = True
-            before = merit
-            rows, pull = _rows(task, z, score, readings, slopes, hues)
-            if miss <= _NEAR and turn > 3:  # all that is left is to be exact
-                pull[:] = 0.0
-            count = len(task.fixed) + len(task.body)
-            # what a step has run into stays a wall in those that follow
-            thinned = thinned or thin > 0.0
-            if thinned:
-                missing[count], rows[count] = thin, uphill
-                count += 1
-            for i in range(2):
-                at_wall[i] |= mended[i] > task.mended[i]
-                if at_wall[i]:
-                    missing[count], rows[count] = task.mended[i] - mended[i], steep[i]
-                    count += 1
-            fits, step = _step(
-                stiff, rows[:count], missing[:count], ground.low, ground.high, z, pull
-            )
-            if not fits:
-                return False, z
-            from_here = z
-        z = np.empty(len(from_here))
-        for k in range(len(z)):
-            z[k] = min(max(from_here[k] + step[k], ground.low[k]), ground.high[k])
-    return False, z
-
-
-@numba.njit(cache=True, nogil=True)
-def _around(ground: Any, task: Any, z: Any) -> Any:
-    """At z (k,): gradients of scores (t, k) and of hues (4, k), the stiffness (k, k) of what had
-    better stay, and the gradients of what decoding mends (2, k)."""
-    k, t = len(z), len(ground.normals)
-    slopes = ground.normals.copy()
-    steps, steep = np.zeros((k + 1, len(READINGS), 3)), np.zeros((2, k))
-    if ground.read:
-        readings, by_z, _, steep = _read(ground, z, True)
-        for i in range(len(readings)):
-            for c in range(3):
-                # formulas of a few numbers: cheaper once more than their slopes
-                steps[0, i, c] = readings[i, c]
-                for n in range(k):
-                    steps[n + 1, i, c] = readings[i, c] + _SMALL * by_z[i, c, n]
-        grades = _interpolated(formulas(steps), ground.used, ground.at, ground.grade)
-        for i in range(t):
-            for n in range(k):
-                for j in range(grades.shape[1]):
-                    change = grades[n + 1, j] - grades[0, j]
-                    slopes[i, n] += ground.weights[i, j] * change / _SMALL
-    for i in range(t):
-        for n in range(k):
-            slopes[i, n] /= ground.span[i]
-    hues = np.zeros((4, k))
-    if task.hued:
-        found, seen = _colours(steps)
-        here = _turned(task.hues, found[0], seen[0])
-        for n in range(k):
-            there = _turned(task.hues, found[n + 1], seen[n + 1])
-            for i in range(4):
-                hues[i, n] = (there[i] - here[i]) / _SMALL
-    stiff = ground.stiffness.copy()
-    for i in task.soft:
-        _stiffen(stiff, slopes[i], _APART)
-    for i in range(len(task.kept)):
-        _stiffen(stiff, task.kept[i], _BODY)
-    for i in range(len(hues)):
-        _stiffen(stiff, hues[i], _HUE)
-    return slopes, hues, stiff, steep
-
-
-@numba.njit(cache=True, nogil=True)
-def _stiffen(stiff: Any, row: Any, by: Any) -> Any:
-    for i in range(len(row)):
-        if row[i] != 0.0:
-            for j in range(len(row)):
-                stiff[i, j] += by * row[i] * row[j]
-
-
-@numba.njit(cache=True, nogil=True)
-def _missing(task: Any, z: Any, way: Any, score: Any, readings: Any) -> Any:
-    """What is missing (m + 3,) of what is fixed, the most of it, and by how many degrees hues are
-    off; the last three are left for walls."""
-    count, most, off = len(task.fixed), 0.0, 0.0
-    missing = np.zeros(count + len(task.body) + 3)
-    for i in range(count):
-        missing[i] = task.start[i] + task.rates[i] * way - score[task.fixed[i]]
-    body = _dots(task.body, z)
-    for i in range(len(body)):
-        missing[count + i] = task.body_at[i] - body[i]
-    for value in missing:
-        most = max(most, abs(value))
-    if task.hued and task.strictly_hued:
-        found, seen = _colours(readings)
-        off = _off(task.hues, found[0], seen[0])
-    return missing, most, off
-
-
-@numba.njit(cache=True, nogil=True)
-def _rows(task: Any, z: Any, score: Any, readings: Any, slopes: Any, hues: Any) -> Any:
-    """The rows (m + 3, k) of what is fixed, and the pull (k,) of what had better stay."""
-    count, k = len(task.fixed), len(z)
-    rows, pull = np.zeros((count + len(task.body) + 3, k)), np.zeros(k)
-    for i in range(count):
-        rows[i] = slopes[task.fixed[i]]
-    for i in range(len(task.body)):
-        rows[count + i] = task.body[i]
-    for i in range(len(task.soft)):
-        away = task.soft_start[i] - score[task.soft[i]]
-        _add(pull, slopes[task.soft[i]], task.back * _APART * away)
-    kept = _dots(task.kept, z)
-    for i in range(len(kept)):
-        _add(pull, task.kept[i], task.back * _BODY * (task.kept_at[i] - kept[i]))
-    if task.hued:
-        found, seen = _colours(readings)
-        turned = _turned(task.hues, found[0], seen[0])
-        for i in range(len(turned)):
-            _add(pull, hues[i], -_HUE * turned[i])
-    return rows, pull
-
-
-@numba.njit(cache=True, nogil=True)
-def _add(total: Any, row: Any, by: Any) -> Any:
-    for k in range(len(row)):
-        total[k] += by * row[k]
-
-
-@numba.njit(cache=True, nogil=True)
-def _step(stiff: Any, rows: Any, wanted: Any, low: Any, high: Any, z: Any, pull: Any) -> Any:
-    """The step (k,) from z that makes step @ stiff @ step / 2 - pull @ step least, with rows @ step
-    = wanted and within low and high; whether there is one, and the step.
-
-    Coordinates that would leave the box stay at its wall.
-    """
-    k, m = len(stiff), len(rows)
-    step, free = np.zeros(k), np.ones(k, np.bool_)
-    size = 1e-12
-    for value in wanted:
-        size = max(size, abs(value))
-    for _ in range(k):
-        at = np.flatnonzero(free)
-        n = len(at)
-        inner, both, rest = np.empty((n, n)), np.empty((n, m + 1)), np.empty(m)
-        for i in range(m):
-            rest[i] = wanted[i]
-            for j in range(k):
-                if not free[j]:
-                    rest[i] -= rows[i, j] * step[j]
+    n = k = len(pull)
+    a, b, at = np.empty((k, k)), np.empty(k), np.empty(k, np.int64)
+    for i in range(k):
+        at[i], x[i] = i, 0.0
+    while n > 0:
         for i in range(n):
-            both[i, m] = pull[at[i]]
-            for j in range(k):
-                if not free[j]:
-                    both[i, m] -= stiff[at[i], j] * step[j]
-            for j in range(n):
-                inner[i, j] = stiff[at[i], at[j]]
-            for j in range(m):
-                both[i, j] = rows[j, at[i]]
-        _solve(inner, both, 0.0)
-        gram, forces = np.zeros((m, m)), np.empty((m, 1))
-        for i in range(m):
-            forces[i, 0] = rest[i]
-            for a in range(n):
-                row = rows[i, at[a]]
-                forces[i, 0] -= row * both[a, m]
-                for j in range(m):
-                    gram[i, j] += row * both[a, j]
-        _solve(gram, forces, _DEPENDENT)
-        for a in range(n):
-            part = both[a, m]
-            for j in range(m):
-                part += both[a, j] * forces[j, 0]
-            if not abs(part) <= _ABSURD:
-                return False, step
-            step[at[a]] = part
-            for i in range(m):
-                rest[i] -= rows[i, at[a]] * part
-        for value in rest:
-            if abs(value) > 0.3 * size:
-                return False, step
-        inside = True
-        for a in range(n):
-            i = at[a]
-            least, most = low[i] - z[i], high[i] - z[i]
-            if step[i] < least - 1e-12 or step[i] > most + 1e-12:
-                step[i] = min(max(step[i], least), most)
-                free[i] = inside = False
-        if inside:
-            return True, step
-        if n == 1:
-            return False, step
-    return False, step
+            b[i] = pull[at[i]]
+            if n < k:
+                for j in range(k):
+                    b[i] -= stiff[at[i], j] * x[j]
+        # Cholesky, with the diagonal of the factor inverted
+        for i in range(n):
+            for j in range(i + 1):
+                part = stiff[at[i], at[j]]
+                for m in range(j):
+                    part -= a[i, m] * a[j, m]
+                if i == j:
+                    a[i, i] = 1.0 / math.sqrt(max(part, 1e-30))
+                else:
+                    a[i, j] = part * a[j, j]
+            for j in range(i):
+                b[i] -= a[i, j] * b[j]
+            b[i] *= a[i, i]
+        for i in range(n - 1, -1, -1):
+            b[i] *= a[i, i]
+            for j in range(i):
+                b[j] -= a[i, j] * b[i]
+        free = 0
+        for i in range(n):
+            j = at[i]
+            x[j] = min(max(b[i], low[j]), high[j])
+            if x[j] == b[i]:
+                at[free] = j
+                free += 1
+        if free == n:
+            break
+        n = free
+        for i in range(n):
+            x[at[i]] = 0.0
 
 
-@numba.njit(cache=True, nogil=True)
-def _solve(a: Any, b: Any, ridge: Any) -> Any:
-    """b (n, m) becomes the solution x of a @ x = b, by Cholesky's factors of a (n, n), symmetric;
-    the ridge, of its greatest diagonal value, lets rows depend on each other."""
-    n, m = b.shape
-    most = 0.0
-    for i in range(n):
-        most = max(most, a[i, i])
-    least = max(ridge, 1e-14) * most + 1e-300
-    for i in range(n):
-        for j in range(i + 1):
-            part = a[i, j]
-            for k in range(j):
-                part -= a[i, k] * a[j, k]
-            if i == j:
-                a[i, i] = math.sqrt(max(part + ridge * most, least))
-            else:
-                a[i, j] = part / a[j, j]
-        for k in range(m):
-            for j in range(i):
-                b[i, k] -= a[i, j] * b[j, k]
-            b[i, k] /= a[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(m):
-            b[i, k] /= a[i, i]
-            for j in range(i):
-                b[j, k] -= a[i, j] * b[i, k]
+class _Aim(NamedTuple):
+    """What a velocity is to do: slopes (n, k) of moved scores, how fast (n,) they shall change,
+    what it costs that they do not, and the share of it that counts as all."""
+
+    slopes: Float64
+    rates: Float64
+    wanted: float
+    full: float
+
+
+class _Walls(NamedTuple):
+    """What a velocity must not pass: the box low, high (k,), and slopes (3, k) of what may not grow
+    by more than gaps (3,)."""
+
+    low: Float64
+    high: Float64
+    slopes: Float64
+    gaps: Float64
+
+
+@_compiled
+def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any, out: Any) -> Any:
+    """Fill in the velocity (k,) at z (k,) that costs least by a form (k, k), of which a step of h
+    stays within the walls.
+
+    A moved score that does not change as fast as asked for costs `wanted`: so it has a greatest
+    speed, and fades where nothing leads on. If there are slopes `turn` (15, k) of colours, it is
+    made as fast as asked for where that is near, and no faster than can be followed.
+    """
+    k, count = len(z), len(aim.rates)
+    low, high, drawn, rates = np.empty(k), np.empty(k), np.empty(k), np.empty(count)
+    stiff, at_wall = np.empty((k, k)), np.empty(len(walls.gaps))
+    for i in range(3):
+        at_wall[i] = 0.0
+    for n in range(k):
+        low[n] = min((walls.low[n] - z[n]) / h, 0.0)
+        high[n] = max((walls.high[n] - z[n]) / h, 0.0)
+    for i in range(count):
+        rates[i] = aim.rates[i]
+    turns = 6 if len(turn) > 0 else 3
+    again = 0
+    while again < turns:
+        for n in range(k):
+            drawn[n] = pull[n]
+            for i in range(count):
+                drawn[n] += aim.wanted * rates[i] * aim.slopes[i, n]
+            for m in range(k):
+                stiff[n, m] = form[n, m]
+        for i in range(3):
+            if at_wall[i] > 0.0:
+                back = _WALL * max(walls.gaps[i], -_BACK) / h
+                for n in range(k):
+                    drawn[n] += back * walls.slopes[i, n]
+                    some = _WALL * walls.slopes[i, n]
+                    for m in range(k):
+                        stiff[n, m] += some * walls.slopes[i, m]
+        _least(stiff, drawn, low, high, out)
+        more = False
+        for i in range(3):
+            if at_wall[i] == 0.0 and walls.gaps[i] < math.inf:
+                ahead = 0.0
+                for n in range(k):
+                    ahead += walls.slopes[i, n] * out[n]
+                if ahead * h > max(walls.gaps[i], 0.0) + 1e-12:
+                    at_wall[i], more = 1.0, True
+        again += 1
+        if more and again % 3 != 0:
+            continue
+        if again > 3:
+            break
+        again = 3
+        for i in range(count):
+            if aim.rates[i] != 0.0:
+                made = 0.0
+                for n in range(k):
+                    made += aim.slopes[i, n] * out[n]
+                rates[i] = aim.rates[i] / min(max(made / aim.rates[i], aim.full), 1.0)
+    shown = length = 0.0
+    for i in range(len(turn) // 3):
+        square = 0.0
+        for j in range(3):
+            change = 0.0
+            for n in range(k):
+                change += turn[3 * i + j, n] * out[n]
+            square += change * change
+        shown = max(shown, square)
+    if len(turn) > 0:
+        for n in range(k):
+            length += out[n] * out[n]
+        over = max(shown / (_SHOWN * _SHOWN), length / (_FASTEST * _FASTEST))
+        slow = (1.0 + over**12) ** (-1.0 / 24.0)  # hardly any below the greatest speed
+        for n in range(k):
+            out[n] *= slow
+
+
+STEEP, WALLED, COLOURED = 1, 2, 4
+"""Why a move makes less way than asked for: flags of `Flow.why`."""
+
+
+class Knot(NamedTuple):
+    """Where a move is: the point (k,), where moved scores (n,) should be, all scores (t,), and
+    whether it has met a wall."""
+
+    z: Float64
+    planned: Float64
+    score: Float64
+    walled: bool
+
+
+class Flow:
+    """A move from one point, found as far as it was asked for and kept: going on costs what is
+    new.
+
+    Every way is gone in the same steps from the same point, so that what lies at 0.5 does not
+    depend on whether 0.48 was looked at before.
+
+    Parameters
+    ----------
+    ground, task : as everywhere here
+    z : (k,) the start, within the box
+    end : how far the move may go
+    around : what there is to know at the start, or None
+    """
+
+    def __init__(
+        self, ground: Ground, task: Task, z: Float64, end: float, around: Around | None = None
+    ) -> None:
+        self.ground, self.task, self.end = ground, task, end
+        around = around or ground.around(z)
+        self._kept = around.score[task.held]
+        self._knots = [Knot(z, around.score[task.moved], around.score, False)]
+        self._base = ground.stiffness + _BODY * task.body.T @ task.body
+        self._by_score = task.score_costs(len(around.score))
+        self._by_colour = task.colour_costs(True)
+        self._idle = 0
+        # of the last knot, from which a drag goes on and on
+        self._around, self._form = (0, around), (-1, self._base)
+
+    @property
+    def score(self) -> Float64:
+        """All scores (t,) at the start."""
+        return self._knots[0].score
+
+    def to(self, way: float) -> Knot:
+        """Where the move is after some way, or where it ends before."""
+        while len(self._knots) * STEP <= min(way, self.end) + _HARDLY:
+            knot, rates = self._knots[-1], self.task.rates
+            found = self._advance(len(self._knots) - 1, STEP)
+            made = float((found.planned - knot.planned) @ rates / (rates @ rates))
+            # at a kink a step may come to nothing, and the next one lead on
+            self._idle = self._idle + 1 if made < _STUCK * STEP else 0
+            if self._idle == _PATIENCE:
+                self.end = min(self.end, len(self._knots) * STEP)
+            self._knots.append(found)
+        way = min(way, self.end)
+        last = len(self._knots) - 1
+        done = last if way > last * STEP else int(way / STEP + _HARDLY)
+        rest = way - done * STEP
+        return self._advance(done, rest) if rest > _HARDLY else self._knots[done]
+
+    def why(self, way: float) -> int:
+        """Why it makes less than all of its way there: `STEEP`, `WALLED` and `COLOURED`, added."""
+        z = self.to(way).z
+        around, task, shares = self.ground.around(z), self.task, []
+        for coloured, walled in ((False, False), (True, False), (True, True)):
+            by = task.colour_costs(coloured)
+            speed = self._velocity(around, z, STEP, self._cost(around, by), walled, False)
+            made = around.slopes[task.moved] @ speed
+            shares.append(float(made @ task.rates / (task.rates @ task.rates)))
+        free, coloured_share, share = shares
+        why = STEEP if free < task.full else 0
+        if coloured_share < min(task.full, free - 0.9 * task.full):
+            why |= COLOURED
+        if share < min(task.full, 0.9 * coloured_share):
+            why |= WALLED
+        return why
+
+    def _cost(self, around: Around, by_colour: Float64) -> Float64:
+        """The quadratic form (k, k) of what a velocity costs: how unlike the library's own
+        differences it is, and how fast it changes what had better stay."""
+        form = self._base.copy()
+        _stiffen(form, around.slopes, self._by_score, around.colours, by_colour)
+        return form
+
+    def _velocity(
+        self,
+        around: Around,
+        z: Float64,
+        h: float,
+        form: Float64,
+        walled: bool = True,
+        shown: bool = True,
+    ) -> Float64:
+        """The field (k,) of the move at z (k,), of which a step of h shall stay within the walls;
+        what it is `shown` as, or what makes it fall short."""
+        task, ground, k = self.task, self.ground, len(z)
+        slopes, gaps = np.empty((3, k)), np.full(3, math.inf)
+        slopes[:2] = around.steep
+        np.multiply(around.uphill, -_THIN, out=slopes[2])
+        low, high = ground.low, ground.high
+        if walled:
+            gaps[:2] = task.mended - around.mended
+            if task.least > -math.inf:
+                gaps[2] = _THIN * (around.likely - task.least)
+        else:
+            low, high = np.full(k, -math.inf), np.full(k, math.inf)
+        turn = around.colours[_TURN:_HUES]
+        aim = _Aim(around.slopes[task.moved], task.rates, task.wanted, task.full)
+        speed = np.empty(k)
+        _speed(
+            form, task.drawn(around.lab, turn), aim, _Walls(low, high, slopes, gaps), z, h,
+            turn if shown else turn[:0], speed,
+        )  # fmt: skip
+        return speed
+
+    def _advance(self, place: int, h: float) -> Knot:
+        """A step of h from a knot.
+
+        The midpoint rule (Hairer, Norsett & Wanner 1993, II.1), in parts where it is fast, or where
+        scores come out other than the field says; then what is off in them is put right along the
+        field's own directions.
+        """
+        ground, task, some_held = self.ground, self.task, len(self.task.held) > 0
+        z, planned, have, walled = self._knots[place]
+        # what is known at a knot serves each step from there
+        if self._around[0] != place:
+            self._around = place, ground.around(z)
+        if self._form[0] != place:
+            self._form = place, self._cost(self._around[1], self._by_colour)
+        around, form = self._around[1], self._form[1]
+        done, step, wary, first, at = 0.0, h, h, None, z
+        for look in range(_LOOKS):
+            if look > 0:
+                around = ground.around(at)
+                form = self._cost(around, self._by_colour)
+            speed = self._velocity(around, at, step, form)
+            if first is None:
+                length = math.sqrt(speed @ speed)
+                first, step = speed, min(h - done, wary, _LONG / max(length, 1e-30))
+                at = self._inside(z, first, 0.5 * step)
+                continue
+            slopes = around.slopes[task.moved]
+            made = step * (slopes @ speed)
+            aim, after = planned + made, self._inside(z, speed, step)
+            score, _, mended = ground.look(after)
+            change = score - have
+            wrong = _most(change[task.moved] - made)
+            if some_held:
+                wrong = max(wrong, _most(change[task.held]))
+            over = mended - task.mended
+            if (wrong > _TRUST or max(over[0], over[1]) > _OVER) and step > h / _PARTS:
+                step *= 0.5
+                at = self._inside(z, first, 0.5 * step)
+                continue
+            # what is too far off to be put right: it goes on from there
+            lost = np.abs(aim - score[task.moved]) > _LOST
+            aim = np.where(lost, score[task.moved], aim)
+            off = self._off(aim, score)
+            for _ in range(_MENDS):
+                if off < _EXACT:
+                    break
+                pull = task.wanted * (aim - score[task.moved]) @ slopes
+                if some_held:
+                    short = self._kept - score[task.held]
+                    pull += _HELD * short @ around.slopes[task.held]
+                put = np.empty(len(z))
+                _least(form, pull, ground.low - after, ground.high - after, put)
+                # no further than a part itself goes: where slopes are faint it would leap
+                put *= min(1.0, 0.5 * step * _most(speed) / max(_most(put), 1e-30))
+                nearer = self._inside(after, put, 1.0)
+                found = ground.look(nearer)[0]
+                left = self._off(aim, found)
+                if left > off:
+                    break
+                after, score, off = nearer, found, left
+            ahead = (score - have)[task.moved] @ task.rates
+            astray = some_held and _most(self._kept - score[task.held]) > _ASTRAY
+            if astray or ahead < -_FALLS:
+                if step <= h / _PARTS:
+                    break  # no further: what is held would not stay, or scores would fall
+                step *= 0.5
+                at = self._inside(z, first, 0.5 * step)
+                continue
+            walled = walled or bool(
+                max(over[0], over[1]) > -_OVER
+                or around.likely < task.least + 1.0
+                or ((after <= ground.low) | (after >= ground.high)).any()
+            )
+            # where a part had to be short the next one will be, too
+            z, at, planned, have, first = after, after, aim, score, None
+            done, wary = done + step, 2.0 * step
+            step = h - done
+            if step <= _HARDLY:
+                break
+        return Knot(z, planned, have, walled)
+
+    def _off(self, aim: Float64, score: Float64) -> float:
+        """How far moved scores (t,) are off their aim (n,), or held ones off where they were."""
+        task = self.task
+        off = _most(aim - score[task.moved])
+        return max(off, _most(self._kept - score[task.held])) if len(task.held) else off
+
+    def _inside(self, z: Float64, speed: Float64, h: float) -> Float64:
+        """z + h * speed, no further than the box."""
+        out = h * speed
+        out += z
+        np.maximum(out, self.ground.low, out=out)
+        return np.minimum(out, self.ground.high, out=out)
+
+
+def _most(values: Float64) -> float:
+    """The greatest amount of a few numbers, 0 of none."""
+    return max(map(abs, values.tolist()), default=0.0)

@@ -34,7 +34,7 @@ class Stroke:
         Change of the trait's score; 1 is from typically low to typically high.
     radius : float
         Of the brush, in pixels. The brush is full in its inner half and fades to its rim.
-    hold : traits or groups that shall stay; None is the colour, unless a colour is painted
+    hold : what shall stay, as for `EditSession.move`; None is what the trait holds by itself
 
     Raises
     ------

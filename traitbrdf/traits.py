@@ -16,9 +16,12 @@ from __future__ import annotations
 import functools
 import io
 import math
+import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,18 +31,19 @@ from traitbrdf.descriptors import describe_columns, descriptors
 from traitbrdf.embedding import BRDFEmbedding, Library, default_embedding, default_library
 from traitbrdf.formats import artifact, unknown_name
 from traitbrdf.moves import (
+    COLOURED,
     PALE,
-    STRIDE,
+    STEEP,
+    STEP,
+    WALLED,
+    Around,
     Density,
+    Flow,
     Grades,
     Ground,
     Optics,
     Readings,
     Task,
-    colours,
-    compromise,
-    follow,
-    possible,
 )
 
 if TYPE_CHECKING:
@@ -48,28 +52,53 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-KEEPS_BODY = frozenset(
-    ("shiny", "glossy", "matte", "strength", "sharpness", "hard", "soft", "rough", "greasy")
-)
+COLOURS = frozenset(("red", "green", "blue", "gold"))
+"""Traits that are colours: their moves hold none unless told to."""
+
+LIGHT = frozenset(("bright", "diffuse", "specular", "silver", "gold", "dusty", "ceramic"))
+"""Traits that are about how light a thing is: their moves hold no lightness unless told to.
+
+"bright" is lightness itself; "diffuse" and "specular" are amounts of reflected light; silver, gold
+and ceramic are light, and dust is paler than what it lies on.
+"""
+
+PALING = frozenset(("dusty", "acrylic", "tint", "silver"))
+"""Traits that say how saturated a thing is: where their moves hold colour, they hold its hue."""
+
+STEERED = MappingProxyType({"gold": (75.0, 0.06, 0.42), "silver": (80.0, 0.0, 0.0)})
+"""Traits that lead towards a colour: its L*, and its a* and b* for an L* + 16 of one. Gold's are
+near those of its reflectance at normal incidence (Johnson & Christy 1972: 91, 0.02, 0.31), and
+those of darker, warmer alloys."""
+
+KEEPS_BODY = frozenset(("shiny", "glossy", "strength", "sharpness", "hard", "greasy", "plastic"))
 """Traits of the highlight: their moves keep the body below it as far as that is possible."""
 
-COLOURFUL = frozenset(("red", "green", "blue", "tint", "gold", "silver", "dusty", "acrylic"))
-"""Traits that are of colour: moves of others keep the hues of body and lobe as far as they can."""
+GROUPS = ("colour", "color", "lightness", "body")
+"""What can be held beside traits: the colour of all reflected light and of the body, how light
+that is, and the look of the body below the highlight."""
 
-GROUPS = {"colour": ("red", "green", "blue"), "color": ("red", "green", "blue")}
-"""Names that stand for several traits where traits are held; with them goes the hue of the body
-and of the lobe."""
+Method = Literal["flow", "linear"]
 
 RELATED = 0.5
 """Rank correlation in the library from which two traits are related: they move together."""
 
-PLAUSIBLE = 0.01
+PLAUSIBLE = 0.002
 """The share of the library that is less plausible than any point that a move may reach."""
 
 _EXTREMES = (1.0, 99.0)  # percentiles of the library that no photoreal move goes beyond
 _BETWEEN = 0.05  # what differences between families count in the metric of moves
 _RIDGE = 1e-3  # of the mean variance: keeps the metric regular where the library is flat
-_HOLE = 0.05  # log f by which the middle of a highlight may be darker than what is around it
+_NEAR = 2.5e-3  # of a score: what is as near as that is reached
+_FAR = 20.0  # units: no move is longer
+_PERCENT = np.linspace(0.0, 1.0, 101)
+_KNOWN = 32  # moves whose way is kept, to go on from
+
+# what it costs, beside the metric of moves, that what is held changes
+_HUE = 3.0  # a degree
+_CHROMA = 0.3  # a unit of a* or b*
+_LIGHTNESS = 0.2  # a unit of L*
+_LOBE = 300.0  # log RGB of the lobe
+_HOLE = 0.12  # log f by which the middle of a highlight may be darker than what is around it
 
 
 @dataclass(frozen=True)
@@ -83,6 +112,7 @@ class Move:
     held : by held trait, how much it changed nevertheless
     plausibility : as `TraitSpace.plausibility` of `z`
     stopped : "" if all was reached, else why not
+    walled : whether it slid along a wall of the gamut, so that the way back may lead elsewhere
     """
 
     z: Float64
@@ -91,6 +121,7 @@ class Move:
     held: Mapping[str, float]
     plausibility: float
     stopped: str = ""
+    walled: bool = False
 
     @property
     def complete(self) -> bool:
@@ -236,6 +267,8 @@ class TraitSpace:
         self._synonyms = {
             other: name for name, (_, others) in self.about.items() for other in others
         }
+        self._flows: OrderedDict[Any, tuple[Flow, float]] = OrderedDict()
+        self._lock = threading.Lock()
         metric = self.covariance + _RIDGE * np.trace(self.covariance) / k * np.eye(k)
         self._ground = Ground.of(
             optics, self.weights, self.normals, self.typical[:, 0], self._span,
@@ -355,11 +388,14 @@ class TraitSpace:
         By a mixture of Gaussians over the families (`Density`). A point outside the box has 0.
         """
         point = self._point(z)
-        outside = np.any((point < self.low - 1e-9) | (point > self.high + 1e-9))
-        if self.density is None or outside:
-            return 0.0 if outside else 1.0
-        share = np.interp(self.density.log(point), self.density.known, np.linspace(0.0, 1.0, 101))
-        return float(share)
+        outside = ((point < self.low - 1e-9) | (point > self.high + 1e-9)).any()
+        return 0.0 if outside else self._common(point)
+
+    def _common(self, z: Float64) -> float:
+        """`plausibility` of a point (k,) in the box."""
+        if self.density is None:
+            return 1.0
+        return float(np.interp(self.density.log(z), self.density.known, _PERCENT))
 
     def explain(
         self, before: ArrayLike, after: ArrayLike, embedding: BRDFEmbedding | None = None
@@ -395,12 +431,20 @@ class TraitSpace:
 
     # -- moves ----------------------------------------------------------------------------------
 
+    def holds(self, amounts: Mapping[str, float]) -> tuple[str, ...]:
+        """What a move holds unless told otherwise: "colour", but where it moves a colour itself
+        (`COLOURS`), and "lightness", but where it is about that (`LIGHT`)."""
+        moved = {self.names[self.index(name)] for name in amounts}
+        colour = () if moved & COLOURS else ("colour",)
+        return colour if moved & LIGHT else (*colour, "lightness")
+
     def move(
         self,
         z: ArrayLike,
         amounts: Mapping[str, float],
-        hold: Iterable[str] = (),
+        hold: Iterable[str] | None = None,
         photoreal: bool = True,
+        method: Method = "flow",
     ) -> Float64:
         """Coordinates (k,) whose scores differ from those of `z` by `amounts`.
 
@@ -408,47 +452,52 @@ class TraitSpace:
         ----------
         z : (k,) array_like
         amounts : for each trait to move by how much; 1 is from typically low to typically high
-        hold : traits whose scores shall stay; "colour" for red, green and blue together, and the
-            hues of body and lobe; "body" for the look of what lies below the highlight
+        hold : what shall stay; None is what `holds` says, () is nothing
+            Names of traits, whose scores stay; "colour", that of all reflected light and of the
+            body as a person sees it; "lightness" of all reflected light; "body", the look of what
+            lies below the highlight.
         photoreal : whether to stay where materials of the library are near
+        method : "flow", or "linear", the straight vectors of Matusik et al. 2003
+            "linear" goes along one direction, the trait's slope at `z` in the metric of the
+            library, holds traits alone, and knows no walls but the box.
 
         Returns
         -------
-        (k,) array inside the gamut box. Where the gamut ends before the change is complete, it is
-        the furthest point reached (`reach` says how far that is, and why). Amounts of 0 return `z`
-        as it is.
+        (k,) array inside the gamut box. Where less than all is reached, it is the furthest point
+        (`reach` says how far that is, and why). Amounts of 0 return `z` as it is.
 
         Examples
         --------
         >>> from traitbrdf import default_library, default_traits
         >>> library, space = default_library(), default_traits()
         >>> z = library.coordinates[library.index("red-rubber")]
-        >>> shinier = space.move(z, {"shiny": 0.5}, hold=("colour",))
-        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 4)
+        >>> shinier = space.move(z, {"shiny": 0.5})
+        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 3)
         0.5
 
         Raises
         ------
         ValueError
             On an unknown trait, one named twice, an amount that is not finite, a trait both moved
-            and held, or held traits that forbid the move altogether; the message says what can be
-            reached.
+            and held, or held traits that forbid the move altogether.
         """
-        return self.moved(z, amounts, hold, photoreal).z
+        return self.moved(z, amounts, hold, photoreal, method).z
 
     def moved(
         self,
         z: ArrayLike,
         amounts: Mapping[str, float],
-        hold: Iterable[str] = (),
+        hold: Iterable[str] | None = None,
         photoreal: bool = True,
+        method: Method = "flow",
     ) -> Move:
         """`move`, with the same errors, and all that is to be said of it."""
-        found = self.reach(z, amounts, hold, photoreal)
+        found = self.reach(z, amounts, hold, photoreal, method)
         if found.stopped.startswith("held"):
             raise ValueError(
-                f"cannot move {sorted(amounts)} while holding {sorted(_names(hold))}: these scores "
-                f"depend on each other; hold fewer traits. Nearest: {found}"
+                f"cannot move {sorted(amounts)} while holding "
+                f"{sorted(self.holds(amounts) if hold is None else _names(hold))}: these scores "
+                f"depend on each other; hold fewer traits"
             )
         return found
 
@@ -456,108 +505,228 @@ class TraitSpace:
         self,
         z: ArrayLike,
         amounts: Mapping[str, float],
-        hold: Iterable[str] = (),
+        hold: Iterable[str] | None = None,
         photoreal: bool = True,
+        method: Method = "flow",
     ) -> Move:
         """`move`, and how far it came.
 
-        Parameters, errors : as for `move`, but where held traits forbid the move, what comes
-        nearest is returned: all scores give way alike.
+        Parameters, errors : as for `move`, but where held traits forbid the move, it stays where
+        it is and `Move.stopped` says so.
         """
         start = self._point(z)
+        moved, held, hold = self._checked(amounts, hold)
+        if all(value == 0.0 for value in moved.values()):
+            return self._said(start.copy(), np.zeros(len(self.names)), moved, held)
+        if method == "linear":
+            end = self._straight(start, moved, held)
+            change = self._ground.look(end)[0] - self._ground.look(start)[0]
+            return self._said(end, change, moved, held)
+        if method != "flow":
+            raise ValueError(f"method: expected 'flow' or 'linear', got {method!r}")
+        whole = max(abs(value) for value in moved.values())
+        with self._lock:
+            flow, room = self._flow(start, moved, held, hold, photoreal)
+            found = flow.to(whole)
+            # a start outside of the box has another score than where its way begins
+            inside = np.all((start >= self.low) & (start <= self.high))
+            change = found.score - (flow.score if inside else self._ground.look(start)[0])
+            move = self._said(found.z, change, moved, held, found.walled)
+            off = max(abs(move.asked[name] - move.reached[name]) for name in move.asked)
+            if off <= _NEAR:
+                return move
+            return replace(move, stopped=self._reason(flow, whole, room, move, hold, photoreal))
+
+    def path(
+        self,
+        z: ArrayLike,
+        amounts: Mapping[str, float],
+        hold: Iterable[str] | None = None,
+        steps: int = 20,
+        photoreal: bool = True,
+    ) -> Float64:
+        """The whole curve (steps + 1, k) of a move, from `z` to where `move` ends, at equal shares
+        of the amounts.
+
+        Other parameters, errors : as for `move`
+
+        Examples
+        --------
+        >>> from traitbrdf import default_library, default_traits
+        >>> library, space = default_library(), default_traits()
+        >>> z = library.coordinates[library.index("red-rubber")]
+        >>> curve = space.path(z, {"shiny": 0.4}, steps=4)
+        >>> (space.scores(curve)[:, space.index("shiny")] - space.score(z)["shiny"]).round(2)
+        array([0. , 0.1, 0.2, 0.3, 0.4])
+        """
+        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+            raise ValueError(f"steps: expected a positive integer, got {steps!r}")
+        shares = np.linspace(0.0, 1.0, int(steps) + 1)
+        last = self.moved(z, amounts, hold, photoreal).z  # and all errors
+        points = [
+            self.reach(z, {name: s * float(value) for name, value in amounts.items()}, hold,
+                       photoreal).z
+            for s in shares[:-1]
+        ]  # fmt: skip
+        return np.array([*points, last])
+
+    def _checked(
+        self, amounts: Mapping[str, float], hold: Iterable[str] | None
+    ) -> tuple[dict[int, float], list[int], tuple[str, ...]]:
+        """The traits that move and by how much, those that are held, and all that is held."""
         moved: dict[int, float] = {}
         for name, value in amounts.items():
             if (i := self.index(name)) in moved:
                 raise ValueError(f"amounts: expected each trait once, got {self.names[i]!r} twice")
             moved[i] = _amount(name, value)
-        hold = _names(hold)
-        held = self._held(hold)
-        clash = [self.names[i] for i in moved if i in held]
+        hold = self.holds(amounts) if hold is None else _names(hold)
+        stay = {name for h in hold for name in self.held(h)}
+        clash = [self.names[i] for i in moved if self.names[i] in stay]
         if clash:
             raise ValueError(f"hold: {clash[0]!r} cannot be moved and held at once")
-        if all(value == 0.0 for value in moved.values()):
-            return self._said(start, start.copy(), moved, held, "")
-        inside = np.clip(start, self.low, self.high)
-        seen = self._ground.look(inside)
-        task = self._task(inside, seen, moved, held, hold, photoreal)
-        whole = max(abs(value) for value in moved.values())
-        end = min(whole, self._room(seen[0], moved)) if photoreal else whole
-        at, way = follow(self._ground, task, start, end)
-        stopped, many = "", len(moved) > 1 or bool(hold)
-        if way < whole:
-            kind = "gamut of plausible materials" if photoreal else "gamut"
-            stopped = f"the {kind} ends here"
-            if way >= end:
-                stopped = "no material of the library goes further"
-            elif many and way < 1e-3 * min(whole, 1.0) and not possible(self._ground, task, at):
-                stopped = "held traits forbid it"
-                at = compromise(self._ground, task, at, min(STRIDE, whole))
-        return self._said(start, at, moved, held, stopped)
+        held = list(dict.fromkeys(self.index(name) for name in hold if name not in GROUPS))
+        return moved, held, hold
 
-    def _room(self, score: Float64, moved: Mapping[int, float]) -> float:
+    def _flow(
+        self,
+        start: Float64,
+        moved: Mapping[int, float],
+        held: list[int],
+        hold: tuple[str, ...],
+        photoreal: bool,
+    ) -> tuple[Flow, float]:
+        """The flow of a move, as far as it is known, and how far its scores may go."""
+        whole = max(abs(value) for value in moved.values())
+        rates = {i: value / whole for i, value in moved.items()}
+        inside = np.clip(start, self.low, self.high)
+        key = (inside.tobytes(), tuple(rates.items()), tuple(held), hold, photoreal)
+        if key in self._flows:
+            self._flows.move_to_end(key)
+        else:
+            around = self._ground.around(inside)
+            room = self._room(around.score, rates) if photoreal else _FAR
+            task = self._task(around, rates, held, hold, photoreal)
+            self._flows[key] = Flow(self._ground, task, inside, room, around), room
+            if len(self._flows) > _KNOWN:
+                self._flows.popitem(last=False)
+        return self._flows[key]
+
+    def _room(self, score: Float64, rates: Mapping[int, float]) -> float:
         """How far a move may go until a score (t,) leaves what the library has."""
-        whole, room = max(abs(value) for value in moved.values()), math.inf
-        for i, value in moved.items():
-            rate = value / whole
+        room = _FAR
+        for i, rate in rates.items():
             if abs(rate) > 1e-9:
-                limit = self.limits[i, 1 if value > 0.0 else 0]
+                limit = self.limits[i, 1 if rate > 0.0 else 0]
                 room = min(room, max(0.0, (limit - score[i]) / rate))
         return float(room)
 
     def _task(
         self,
-        inside: Float64,
-        seen: tuple[Float64, Float64, Float64],
-        moved: Mapping[int, float],
+        around: Around,
+        rates: Mapping[int, float],
         held: list[int],
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> Task:
-        """The move from a point of the box of which `Ground.look` has `seen`."""
-        whole = max(abs(value) for value in moved.values())
-        fixed = np.array([*moved, *held], np.int64)
-        rates = np.array([*(value / whole for value in moved.values()), *([0.0] * len(held))])
-        known = np.abs(self.related[list(moved)])
-        apart = np.flatnonzero((known < RELATED).all(axis=0))
-        soft = np.setdiff1d(apart, fixed)
-        body = self.body if "body" in hold else self.body[:0]
-        keeps = "body" not in hold and any(self.names[i] in KEEPS_BODY for i in moved)
-        kept = self.body if keeps else self.body[:0]
+        """The move from a point of the box."""
+        known = np.abs(self.related[list(rates)])
+        apart = np.setdiff1d(np.flatnonzero((known < RELATED).all(axis=0)), [*rates, *held])
         least = -math.inf
         if photoreal and self.density is not None:
-            limit = float(np.interp(PLAUSIBLE, np.linspace(0.0, 1.0, 101), self.density.known))
+            limit = float(np.interp(PLAUSIBLE, _PERCENT, self.density.known))
             # members at the rim may stay as unlikely as they are
-            least = min(limit, self.density.log(inside))
-        coloured = any(self.names[i] in COLOURFUL for i in moved)
-        strictly = "colour" in hold or "color" in hold
-        score, readings, mended = seen
+            least = min(limit, around.likely)
         free = not photoreal or self.optics is None
-        mends = np.full(2, math.inf) if free else np.maximum(mended, [_HOLE, 0.0])
-        hued = self.optics is not None and (strictly or not coloured)
+        mends = np.full(2, math.inf) if free else np.maximum(around.mended, [_HOLE, 0.0])
+        moved = {self.names[i] for i in rates}
+        colour = float(self.optics is not None and ("colour" in hold or "color" in hold))
+        bodily = float(self.optics is not None and "body" not in hold and bool(moved & KEEPS_BODY))
+        light = float(self.optics is not None and "lightness" in hold)
+        paling = bool(moved & PALING)
+        steered = [name for name in moved if name in STEERED] if len(moved) == 1 else []
+        ints = (np.array([*some], np.int64) for some in (rates, held, apart))
+        which, stay, others = ints
         return Task(
-            fixed, rates, score[fixed], soft, score[soft], body, body @ inside, kept,
-            kept @ inside, hued, colours(readings), strictly, least, mends,
-        )  # fmt: skip
+            which,
+            np.array([*rates.values()]),
+            stay,
+            others,
+            colour * _HUE * np.array([1.0, 1.0, 1.0, 1.0, 0.3]),
+            colour * (0.0 if paling else _CHROMA) * np.array([1.0, 1.0, 1.0, 0.1, 1.0])
+            + bodily * _CHROMA * np.array([0.0, 0.0, 0.0, 0.3, 0.0]),
+            light * _LIGHTNESS * np.array([1.0, 1.0, 1.0, 0.0, 0.3])
+            + bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 2.0, 0.0]),
+            bool(steered),
+            np.array(STEERED[steered[0]] if steered else (0.0, 0.0, 0.0)),
+            colour * _LOBE,
+            _LIGHTNESS * float("bright" in moved),
+            self.body if "body" in hold else self.body[:0],
+            least,
+            mends,
+        )
+
+    def _reason(
+        self,
+        flow: Flow,
+        whole: float,
+        room: float,
+        move: Move,
+        hold: tuple[str, ...],
+        photoreal: bool,
+    ) -> str:
+        """Why a move did not reach all that was asked for."""
+        way = max(abs(value) for value in move.reached.values())
+        many = len(move.asked) > 1 or any(name not in GROUPS for name in hold)
+        if many and way < 1e-2 * min(whole, 1.0) and flow.why(0.0) & STEEP:
+            return "held traits forbid it"
+        if room < whole and way >= room - _NEAR:
+            return "no material of the library goes further"
+        why = flow.why(max(min(whole, flow.end) - 0.5 * STEP, 0.0))
+        if why & WALLED:
+            return f"the gamut{' of plausible materials' if photoreal else ''} ends here"
+        if why & COLOURED:
+            return "colour and lightness that stay leave no more"
+        return "more would be a leap: the trait hardly depends on anything here"
+
+    def _straight(self, start: Float64, moved: Mapping[int, float], held: list[int]) -> Float64:
+        """The end (k,) of a straight move: along slopes at the start, in the metric of moves."""
+        inside = np.clip(start, self.low, self.high)
+        slopes = self._ground.slopes(inside)[[*moved, *held]]
+        along = np.linalg.solve(self._ground.stiffness, slopes.T)
+        asked = np.array([*moved.values(), *([0.0] * len(held))])
+        step = along @ np.linalg.lstsq(slopes @ along, asked, rcond=1e-9)[0]
+        return np.asarray(np.clip(inside + step, self.low, self.high))
 
     def _said(
-        self, start: Float64, z: Float64, moved: Mapping[int, float], held: list[int], stopped: str
+        self,
+        z: Float64,
+        change: Float64,
+        moved: Mapping[int, float],
+        held: list[int],
+        walled: bool = False,
     ) -> Move:
-        change = self._ground.look(z)[0] - self._ground.look(start)[0]
+        """What came of a move to z (k,), by which all scores (t,) change."""
+        made = change.tolist()
         return Move(
             z,
             {self.names[i]: value for i, value in moved.items()},
-            {self.names[i]: float(change[i]) for i in moved},
-            {self.names[i]: float(change[i]) for i in held},
-            self.plausibility(np.clip(z, self.low, self.high)),
-            stopped,
+            {self.names[i]: made[i] for i in moved},
+            {self.names[i]: made[i] for i in held},
+            self._common(np.minimum(np.maximum(z, self.low), self.high)),
+            walled=walled,
         )
 
-    def members(self, hold: str) -> list[int]:
-        """The traits, by their place, that a name stands for where it is held."""
-        return [] if hold == "body" else [self.index(name) for name in GROUPS.get(hold, (hold,))]
+    def held(self, hold: str) -> tuple[str, ...]:
+        """The traits (by name) that cannot be moved while a name is held.
 
-    def _held(self, hold: tuple[str, ...]) -> list[int]:
-        return list(dict.fromkeys(i for name in hold for i in self.members(name)))
+        Raises
+        ------
+        ValueError
+            On an unknown name.
+        """
+        if hold in GROUPS:
+            return ("red", "green", "blue") if hold in ("colour", "color") else ()
+        return (self.names[self.index(hold)],)
 
     def _point(self, z: ArrayLike) -> Float64:
         value = np.asarray(z, np.float64)

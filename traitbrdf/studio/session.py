@@ -64,7 +64,6 @@ from traitbrdf.editing import EditSession
 from traitbrdf.formats import Display, exposure_of, unknown_name
 from traitbrdf.scene import Camera
 from traitbrdf.strokes import Stroke
-from traitbrdf.traits import GROUPS
 
 Header = dict[str, Any]
 Reply = tuple[Header, list[bytes]]
@@ -355,8 +354,7 @@ class Session:
         if self._sliding and self._hand == view:
             self._take_back()
         self._give_up()
-        hold = () if set(amounts) & set(GROUPS["colour"]) else ("colour",)
-        self.edit.move(part, hold, **values)
+        self.edit.move(part, **values)
         if slide.get("done") is not True:
             self._mine, self._hand, self._sliding = self.edit.last, view, True
 
