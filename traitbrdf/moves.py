@@ -37,7 +37,7 @@ _APART = 2.0  # what a change of unrelated scores costs, beside the metric
 _BODY = 30.0  # what a change of the body costs, where it is kept
 _STEER = 0.1  # what it costs to miss a unit of a* or b* of the colour that a move leads to
 _KEEN = 4.0  # shares of what is missing that are made up for in a unit
-_TURNING = 120.0  # colour difference for a unit: no faster
+_TURNING = 105.0  # colour difference for a unit: no faster
 _TINGED = 0.15  # log RGB: less is grey
 _HELD = 1e6  # what a change of a held score costs
 _WANTED = 3000.0  # what it costs that a moved score stays behind
@@ -46,7 +46,7 @@ _WALL = 1e5  # what it costs to go through a wall
 _BACK = 0.05  # the most that a step goes back to a wall that the last one went through
 _THIN = 0.1  # of log density, beside what decoding mends
 _MENDS = 4  # how often scores are put right after a step
-_EXACT = 1e-5  # how near a score is brought
+_EXACT = 2e-4  # how near a score is brought
 _OVER = 0.02  # log f by which a step may go through a wall
 _TRUST = 0.01  # how far a step's scores may be from what the field says
 _ASTRAY = 2e-3  # how far held scores may be from where they were
@@ -54,11 +54,11 @@ _FALLS = 5e-4  # by which a moved score may fall in a part of a step
 _LOST = 0.02  # what is further off is no error of a step
 _SMOOTH = 0.12  # of a descriptor's range: over which its distribution is smoothed
 _POWER = 48  # of the norm that stands for the greatest albedo: smooth, and 5 % above at most
-_LONG = 0.25  # standard deviations: no part of a step is longer
+_LONG = 0.4  # standard deviations: no part of a step is longer
 _PARTS = 16.0  # shorter than that part of a step it is never made
 _LOOKS = 48  # at the field, in a step
 _FASTEST = 20.0  # standard deviations for a unit
-_SHOWN = 150.0  # of the CIE 1976 colour difference for a unit
+_SHOWN = 130.0  # of the CIE 1976 colour difference for a unit
 _HARDLY = 1e-9  # less than this is no way at all
 _STUCK = 0.02  # of the way asked for: what makes less has ended
 _PATIENCE = 3  # steps that come to nothing before a move ends
@@ -866,13 +866,14 @@ STEEP, WALLED, COLOURED = 1, 2, 4
 
 
 class Knot(NamedTuple):
-    """Where a move is: the point (k,), where moved scores (n,) should be, all scores (t,), and
-    whether it has met a wall."""
+    """Where a move is: the point (k,), where moved scores (n,) should be, all scores (t,),
+    whether it has met a wall, and how fast (k,) it went last."""
 
     z: Float64
     planned: Float64
     score: Float64
     walled: bool
+    speed: Float64 | None
 
 
 class Flow:
@@ -896,13 +897,12 @@ class Flow:
         self.ground, self.task, self.end = ground, task, end
         around = around or ground.around(z)
         self._kept = around.score[task.held]
-        self._knots = [Knot(z, around.score[task.moved], around.score, False)]
+        self._knots = [Knot(z, around.score[task.moved], around.score, False, None)]
         self._base = ground.stiffness + _BODY * task.body.T @ task.body
         self._by_score = task.score_costs(len(around.score))
         self._by_colour = task.colour_costs(True)
         self._idle = 0
-        # of the last knot, from which a drag goes on and on
-        self._around, self._form = (0, around), (-1, self._base)
+        self._start = around
 
     @property
     def score(self) -> Float64:
@@ -986,21 +986,18 @@ class Flow:
 
         The midpoint rule (Hairer, Norsett & Wanner 1993, II.1), in parts where it is fast, or where
         scores come out other than the field says; then what is off in them is put right along the
-        field's own directions.
+        field's own directions. The middle is guessed by the velocity of the part before, which
+        saves half of the looks at the field; where that misleads, by the velocity here.
         """
         ground, task, some_held = self.ground, self.task, len(self.task.held) > 0
-        z, planned, have, walled = self._knots[place]
-        # what is known at a knot serves each step from there
-        if self._around[0] != place:
-            self._around = place, ground.around(z)
-        if self._form[0] != place:
-            self._form = place, self._cost(self._around[1], self._by_colour)
-        around, form = self._around[1], self._form[1]
-        done, step, wary, first, at = 0.0, h, h, None, z
-        for look in range(_LOOKS):
-            if look > 0:
-                around = ground.around(at)
-                form = self._cost(around, self._by_colour)
+        z, planned, have, walled, first = self._knots[place]
+        done, step, wary, guessed, at = 0.0, h, h, first is not None, z
+        if first is not None:
+            step = min(h, _LONG / max(math.sqrt(first @ first), 1e-30))
+            at = self._inside(z, first, 0.5 * step)
+        for _ in range(_LOOKS):
+            around = self._start if at is self._knots[0].z else ground.around(at)
+            form = self._cost(around, self._by_colour)
             speed = self._velocity(around, at, step, form)
             if first is None:
                 length = math.sqrt(speed @ speed)
@@ -1016,9 +1013,12 @@ class Flow:
             if some_held:
                 wrong = max(wrong, _most(change[task.held]))
             over = mended - task.mended
-            if (wrong > _TRUST or max(over[0], over[1]) > _OVER) and step > h / _PARTS:
-                step *= 0.5
-                at = self._inside(z, first, 0.5 * step)
+            if (wrong > _TRUST or max(over[0], over[1]) > _OVER) and (guessed or step > h / _PARTS):
+                if guessed:
+                    first, at, guessed = None, z, False
+                else:
+                    step *= 0.5
+                    at = self._inside(z, first, 0.5 * step)
                 continue
             # what is too far off to be put right: it goes on from there
             lost = np.abs(aim - score[task.moved]) > _LOST
@@ -1044,6 +1044,9 @@ class Flow:
             ahead = (score - have)[task.moved] @ task.rates
             astray = some_held and _most(self._kept - score[task.held]) > _ASTRAY
             if astray or ahead < -_FALLS:
+                if guessed:
+                    first, at, guessed = None, z, False
+                    continue
                 if step <= h / _PARTS:
                     break  # no further: what is held would not stay, or scores would fall
                 step *= 0.5
@@ -1054,13 +1057,16 @@ class Flow:
                 or around.likely < task.least + 1.0
                 or ((after <= ground.low) | (after >= ground.high)).any()
             )
-            # where a part had to be short the next one will be, too
-            z, at, planned, have, first = after, after, aim, score, None
-            done, wary = done + step, 2.0 * step
-            step = h - done
-            if step <= _HARDLY:
+            z, planned, have, first, guessed = after, aim, score, speed, True
+            done += step
+            if h - done <= _HARDLY:
                 break
-        return Knot(z, planned, have, walled)
+            # where a part had to be short the next one will be, too
+            wary = 2.0 * step
+            length = math.sqrt(first @ first)
+            step = min(h - done, wary, _LONG / max(length, 1e-30))
+            at = self._inside(z, first, 0.5 * step)
+        return Knot(z, planned, have, walled, first if guessed else None)
 
     def _off(self, aim: Float64, score: Float64) -> float:
         """How far moved scores (t,) are off their aim (n,), or held ones off where they were."""

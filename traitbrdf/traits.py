@@ -655,7 +655,7 @@ class TraitSpace:
             colour * (0.0 if paling else _CHROMA) * np.array([1.0, 1.0, 1.0, 0.1, 1.0])
             + bodily * _CHROMA * np.array([0.0, 0.0, 0.0, 0.3, 0.0]),
             light * _LIGHTNESS * np.array([1.0, 1.0, 1.0, 0.0, 0.3])
-            + bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 2.0, 0.0]),
+            + bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 3.0, 0.0]),
             bool(steered),
             np.array(STEERED[steered[0]] if steered else (0.0, 0.0, 0.0)),
             colour * _LOBE,
