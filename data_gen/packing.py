@@ -132,8 +132,7 @@ def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
     first = READINGS.index("profile 0")
     profile = np.array([np.flatnonzero(row) for row in rows[first : first + len(PROFILE)]])
     columns = np.flatnonzero(grid.theta_h <= HIGHLIGHT)[:, None] * per + profile[0] % per
-    outer = profile[np.radians(PROFILE) > HIGHLIGHT]
     kept = np.union1d(np.flatnonzero(rows.any(axis=0)), columns)
     log_rows, mean = embedding.log_rows(kept)
-    inner, beyond = (np.searchsorted(kept, cells) for cells in (columns, outer))
-    return Readings(log_rows, mean, rows[:count, kept], inner, beyond, rows[count:, kept])
+    inner = np.searchsorted(kept, columns)
+    return Readings(log_rows, mean, rows[:count, kept], inner, rows[count:, kept])

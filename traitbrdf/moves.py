@@ -239,7 +239,6 @@ class Readings(NamedTuple):
     weights : (readings, cells)
     columns : (n, c) int64, the cells from the middle to the rim of the highlight, for each theta_d
         that the profile has
-    outer : (m, c) int64, cells of the profile beyond
     energy : (angles, cells), directional albedos at angles from 0 to 80 degrees
     """
 
@@ -247,7 +246,6 @@ class Readings(NamedTuple):
     mean: Float64
     weights: Float64
     columns: NDArray[np.int64]
-    outer: NDArray[np.int64]
     energy: Float64
 
     def at(self, z: Float64) -> Float64:
@@ -665,9 +663,6 @@ class Task(NamedTuple):
     body: Float64
     least: float
     mended: Float64
-    wanted: float = _WANTED
-    full: float = _FULL
-    apart_cost: float = _APART
 
     def colour_costs(self, coloured: bool) -> Float64:
         """What changes (_COLOURS,) of `_colour_rows` cost; if not `coloured`, hues may change."""
@@ -688,9 +683,9 @@ class Task(NamedTuple):
     def score_costs(self, count: int) -> Float64:
         """What it costs that scores (count,) change, or that moved ones change otherwise."""
         costs = np.zeros(count)
-        costs[self.apart] = self.apart_cost
+        costs[self.apart] = _APART
         costs[self.held] = _HELD
-        costs[self.moved] = self.wanted
+        costs[self.moved] = _WANTED
         return costs
 
     def drawn(self, lab: Float64, turn: Float64) -> Float64:
@@ -767,13 +762,11 @@ def _least(stiff: Any, pull: Any, low: Any, high: Any, x: Any) -> Any:
 
 
 class _Aim(NamedTuple):
-    """What a velocity is to do: slopes (n, k) of moved scores, how fast (n,) they shall change,
-    what it costs that they do not, and the share of it that counts as all."""
+    """What a velocity is to do: slopes (n, k) of moved scores, and how fast (n,) they shall
+    change."""
 
     slopes: Float64
     rates: Float64
-    wanted: float
-    full: float
 
 
 class _Walls(NamedTuple):
@@ -791,7 +784,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
     """Fill in the velocity (k,) at z (k,) that costs least by a form (k, k), of which a step of h
     stays within the walls.
 
-    A moved score that does not change as fast as asked for costs `wanted`: so it has a greatest
+    A moved score that does not change as fast as asked for costs `_WANTED`: so it has a greatest
     speed, and fades where nothing leads on. If there are slopes `turn` (15, k) of colours, it is
     made as fast as asked for where that is near, and no faster than can be followed.
     """
@@ -811,7 +804,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
         for n in range(k):
             drawn[n] = pull[n]
             for i in range(count):
-                drawn[n] += aim.wanted * rates[i] * aim.slopes[i, n]
+                drawn[n] += _WANTED * rates[i] * aim.slopes[i, n]
             for m in range(k):
                 stiff[n, m] = form[n, m]
         for i in range(3):
@@ -842,7 +835,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
                 made = 0.0
                 for n in range(k):
                     made += aim.slopes[i, n] * out[n]
-                rates[i] = aim.rates[i] / min(max(made / aim.rates[i], aim.full), 1.0)
+                rates[i] = aim.rates[i] / min(max(made / aim.rates[i], _FULL), 1.0)
     shown = length = 0.0
     for i in range(len(turn) // 3):
         square = 0.0
@@ -936,10 +929,10 @@ class Flow:
             made = around.slopes[task.moved] @ speed
             shares.append(float(made @ task.rates / (task.rates @ task.rates)))
         free, coloured_share, share = shares
-        why = STEEP if free < task.full else 0
-        if coloured_share < min(task.full, free - 0.9 * task.full):
+        why = STEEP if free < _FULL else 0
+        if coloured_share < min(_FULL, free - 0.9 * _FULL):
             why |= COLOURED
-        if share < min(task.full, 0.9 * coloured_share):
+        if share < min(_FULL, 0.9 * coloured_share):
             why |= WALLED
         return why
 
@@ -973,7 +966,7 @@ class Flow:
         else:
             low, high = np.full(k, -math.inf), np.full(k, math.inf)
         turn = around.colours[_TURN:_HUES]
-        aim = _Aim(around.slopes[task.moved], task.rates, task.wanted, task.full)
+        aim = _Aim(around.slopes[task.moved], task.rates)
         speed = np.empty(k)
         _speed(
             form, task.drawn(around.lab, turn), aim, _Walls(low, high, slopes, gaps), z, h,
@@ -1027,7 +1020,7 @@ class Flow:
             for _ in range(_MENDS):
                 if off < _EXACT:
                     break
-                pull = task.wanted * (aim - score[task.moved]) @ slopes
+                pull = _WANTED * (aim - score[task.moved]) @ slopes
                 if some_held:
                     short = self._kept - score[task.held]
                     pull += _HELD * short @ around.slopes[task.held]
