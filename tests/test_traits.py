@@ -196,7 +196,9 @@ def test_straight_vectors_go_straight():
     assert abs(SPACE.score(held)["bright"] - SPACE.score(z)["bright"]) < 1e-3
     flow = SPACE.move(z, {"shiny": 0.01}, ("bright",))
     assert SPACE.score(held)["shiny"] == pytest.approx(SPACE.score(flow)["shiny"], abs=1e-3)
-    assert np.all(SPACE.move(z, {"shiny": 30.0}, method="linear") <= HIGH)
+    far = SPACE.reach(z, {"shiny": 30.0}, method="linear")
+    assert np.all(far.z <= HIGH)
+    assert far.stopped == "a straight way ends elsewhere"
     with pytest.raises(ValueError, match="method: expected 'flow' or 'linear'"):
         SPACE.move(z, {"shiny": 0.1}, method="newton")
 

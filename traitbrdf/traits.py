@@ -516,14 +516,16 @@ class TraitSpace:
         """
         start = self._point(z)
         moved, held, hold = self._checked(amounts, hold)
+        if method not in ("flow", "linear"):
+            raise ValueError(f"method: expected 'flow' or 'linear', got {method!r}")
         if all(value == 0.0 for value in moved.values()):
             return self._said(start.copy(), np.zeros(len(self.names)), moved, held)
         if method == "linear":
             end = self._straight(start, moved, held)
             change = self._ground.look(end)[0] - self._ground.look(start)[0]
-            return self._said(end, change, moved, held)
-        if method != "flow":
-            raise ValueError(f"method: expected 'flow' or 'linear', got {method!r}")
+            move = self._said(end, change, moved, held)
+            missed = any(abs(move.asked[n] - move.reached[n]) > _NEAR for n in move.asked)
+            return replace(move, stopped="a straight way ends elsewhere" if missed else "")
         whole = max(abs(value) for value in moved.values())
         with self._lock:
             flow, room = self._flow(start, moved, held, hold, photoreal)
