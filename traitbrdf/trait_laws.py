@@ -664,10 +664,21 @@ def trait_laws(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     if quick:  # over before processes have started
         yield from _laws(data, size, map, say)
         return
-    with concurrent.futures.ProcessPoolExecutor(
-        os.cpu_count(), mp_context=multiprocessing.get_context("spawn")
-    ) as pool:
-        yield from _laws(data, size, pool.map, say)
+    # a thread each: processes that share the cores wait for each other's threads most of the time
+    alone = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    before = {name: os.environ.get(name) for name in alone}
+    os.environ.update(alone)
+    try:
+        with concurrent.futures.ProcessPoolExecutor(
+            os.cpu_count(), mp_context=multiprocessing.get_context("spawn")
+        ) as pool:
+            yield from _laws(data, size, pool.map, say)
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _laws(data: Path | None, size: _Size, each: Each, say: Say) -> Iterator[Record]:
