@@ -1981,7 +1981,7 @@ def test_a_graphics_card_shows_the_same(prepared_ball):
 
 
 def test_a_move_says_how_far_it_came(edit):
-    edit.assign("handle", "red-rubber")
+    edit.assign("handle", "blue-plastic")
     assert edit.reached("handle") is None
     edit.move("handle", shiny=0.3)
     found = edit.reached("handle")
