@@ -525,7 +525,9 @@ def test_angles_that_a_scene_shows(part):
     assert picture.shape[2] == 3
 
 
-def test_a_sphere_design_survives_its_file(tmp_path):
+def test_a_sphere_design_survives_its_file(tmp_path, monkeypatch):
+    # which number type is faster is measured: on a busy machine it comes out either way
+    monkeypatch.setattr(promises, "_median_seconds", lambda *_: 1e-3)
     camera = tb.Camera.orbit(10.0, 80.0, fov=50.0, zoom=0.7, target=(0.1, 2.0, 3.0))
     light = tb.DirectionalLight((0.3, 0.2, 0.7))
     sky = tb.EnvironmentMap.sky(rows=16).rotated(-1.0)
