@@ -175,6 +175,23 @@ def test_what_a_move_comes_to_does_not_depend_on_what_was_asked_before():
         np.testing.assert_array_equal(cold.move(INNER[1], {"glossy": amount}), found)
 
 
+@settings(deadline=None, max_examples=20)
+@given(members, names, st.sampled_from([None, ("rough",), ()]), st.booleans())
+def test_a_drag_is_smooth_between_the_steps_of_a_move(z, name, hold, up):
+    if held_by(name, hold):
+        return
+    amounts = np.linspace(0.0, 0.3, 46) * (1.0 if up else -1.0)
+    moves = [SPACE.reach(z, {name: a}, hold) for a in amounts]
+    way = np.array([m.z for m in moves])
+    shown = np.array([SPACE._ground.seen(point) for point in way])
+    assert np.linalg.norm(np.diff(shown, axis=0), axis=-1).max() < 20.0 * (0.3 / 45) / 0.05
+    for amount, m in zip(amounts, moves, strict=True):
+        if m.complete:
+            assert m.reached[name] == pytest.approx(amount, abs=2.6e-3)
+        assert max(map(abs, m.held.values()), default=0.0) < 0.02
+    assert np.all((way >= LOW) & (way <= HIGH))
+
+
 def test_a_path_is_the_whole_curve_of_a_move():
     curve = SPACE.path(INNER[2], {"rough": -0.4, "bright": 0.2}, steps=8)
     assert curve.shape == (9, 24)

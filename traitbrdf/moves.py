@@ -248,13 +248,6 @@ class Readings(NamedTuple):
     columns: NDArray[np.int64]
     energy: Float64
 
-    def at(self, z: Float64) -> Float64:
-        """Readings (..., readings, 3) at z (..., k), as decoding mends them."""
-        points = _plain(z).reshape(-1, z.shape[-1])
-        cells = _Cells.of(self)
-        found = [cells.near(point, False)[0] for point in points]
-        return np.reshape(found, (*z.shape[:-1], len(self.weights), 3))
-
 
 class _Cells(NamedTuple):
     """`Readings` without the zeros, and the albedos after them as readings more.
@@ -334,10 +327,15 @@ def _near(
     for n in range(len(cells.mean)):
         x, y, w = raised[0, n], raised[1, n], raised[2, n]
         for c in range(3):
-            log = cells.mean[n] + OPPONENT[0, c] * x + OPPONENT[1, c] * y + OPPONENT[2, c] * w
+            raised[c, n] = (
+                cells.mean[n] + OPPONENT[0, c] * x + OPPONENT[1, c] * y + OPPONENT[2, c] * w
+            )
+    for c in range(3):
+        for n in range(len(cells.mean)):
+            source[c, n] = n
             # exp as 64th power of its series: a library's is called for each cell alone, which
             # was most of the work
-            t = min(log, 30.0) / 64.0
+            t = min(raised[c, n], 30.0) * (1 / 64)
             e = 1.0 + t * (1 / 11 + t * (1 / 132 + t * (1 / 1716)))
             e = 1.0 + t * (1 / 8 + t * (1 / 72 + t * (1 / 720) * e))
             e = 1.0 + t * (1 / 5 + t * (1 / 30 + t * (1 / 210) * e))
@@ -348,7 +346,6 @@ def _near(
             e *= e
             e *= e
             raised[c, n] = e * e
-            source[c, n] = n
     # the middle of the profile is darker than its brightest by
     brightest, most, middle = 0, 0.0, 0.0
     for i in range(len(columns)):
@@ -494,6 +491,36 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
         rows[_BESIDE, n] = rows[3 * _BODY_OF, n] - rows[3, n]
 
 
+@_compiled
+def _around_readings(readings: Any, by_z: Any, steps: Any) -> Any:
+    """Fill in readings (k + 1, readings, 3) a small step along each coordinate away, the first of
+    none, by their slopes (readings, 3, k)."""
+    for i in range(len(readings)):
+        for c in range(3):
+            steps[0, i, c] = readings[i, c]
+            for n in range(by_z.shape[2]):
+                steps[n + 1, i, c] = readings[i, c] + _SMALL * by_z[i, c, n]
+
+
+@_compiled
+def _weigh(graded: Any, weights: Any, normals: Any, zero: Any, z: Any, score: Any, by: Any) -> Any:
+    """Fill in scores (t,) of graded descriptors (m, d), and if there are those a small step along
+    each coordinate away, slopes (t, k)."""
+    for t in range(len(score)):
+        here = -zero[t]
+        for n in range(len(z)):
+            here += normals[t, n] * z[n]
+        raw = 0.0
+        for d in range(weights.shape[1]):
+            raw += weights[t, d] * graded[0, d]
+        score[t] = here + raw
+        for n in range(len(graded) - 1):
+            there = 0.0
+            for d in range(weights.shape[1]):
+                there += weights[t, d] * graded[n + 1, d]
+            by[t, n] = normals[t, n] + (there - raw) / _SMALL
+
+
 class Optics(NamedTuple):
     """What lets scores be read off descriptors: where they are read, and how they are graded."""
 
@@ -509,18 +536,21 @@ class Around(NamedTuple):
     score, slopes : (t,) and (t, k)
     lab : (5, 3) CIELAB of `SURFACES`
     colours : (_COLOURS, k), how colours change, as `_colour_rows`
-    mended, steep : (2,) and (2, k), what decoding mends and its slopes, as `_Cells.near`
-    likely, uphill : log density and its gradient (k,), zeros without one
+    walls, steep : (3,) and (3, k), what may not grow beyond a limit, and its slopes: what decoding
+        mends, as `_Cells.near`, and how `unlikely` the point is
     """
 
     score: Float64
     slopes: Float64
     lab: Float64
     colours: Float64
-    mended: Float64
+    walls: Float64
     steep: Float64
-    likely: float
-    uphill: Float64
+
+
+def unlikely(log: float) -> float:
+    """How unlikely a point is of which the log density is known, on the scale of `Around.walls`."""
+    return -_THIN * log
 
 
 class Ground(NamedTuple):
@@ -530,7 +560,7 @@ class Ground(NamedTuple):
     ----------
     cells : None if scores are not read off descriptors
     used : (d,) places of the graded descriptors among all
-    grades : as `Grades`
+    at, grade : as of `Grades`
     weights, normals, zero : (t, d), (t, k) and (t,), scores: weights @ grades + normals @ z - zero
     stiffness : (k, k) metric of moves
     low, high : (k,)
@@ -539,7 +569,8 @@ class Ground(NamedTuple):
 
     cells: _Cells | None
     used: NDArray[np.int64]
-    grades: Grades
+    at: Float64
+    grade: Float64
     weights: Float64
     normals: Float64
     zero: Float64
@@ -568,7 +599,8 @@ class Ground(NamedTuple):
         return cls(
             _Cells.of(optics.readings) if optics else None,
             _places(names),
-            Grades(names, _plain(at), _plain(grade)),
+            _plain(at),
+            _plain(grade),
             _plain(weights / span[:, None]),
             _plain(normals / span[:, None]),
             zero / span,
@@ -589,42 +621,53 @@ class Ground(NamedTuple):
     def look(self, z: Float64) -> tuple[Float64, Float64, Float64]:
         """Scores (t,) at z (k,), readings (readings, 3) and what decoding mends (2,), as
         `_Cells.near`; zeros where nothing is read."""
-        score = self.normals @ z - self.zero
         if self.cells is None:
-            return score, np.zeros((len(READINGS), 3)), np.zeros(2)
-        readings, _, mended, _ = self.cells.near(_plain(z), False)
-        score += self.weights @ self._graded(readings[None])[0]
+            return self.normals @ z - self.zero, np.zeros((len(READINGS), 3)), np.zeros(2)
+        point = _plain(z)
+        readings, _, mended, _ = self.cells.near(point, False)
+        score = np.empty(len(self.zero))
+        graded = self._graded(readings[None])
+        _weigh(graded, self.weights, self.normals, self.zero, point, score, self.normals[:0])
         return score, readings, mended
 
     def around(self, z: Float64) -> Around:
         """What there is to know at z (k,)."""
         k, point = len(z), _plain(z)
-        score, slopes = self.normals @ point - self.zero, self.normals
         lab, colours = np.zeros((len(_SEEN_AT), 3)), np.zeros((_COLOURS, k))
-        mended, steep = np.zeros(2), np.zeros((2, k))
-        likely, uphill = self.density.slope(point) if self.density else (0.0, np.zeros(k))
-        if self.cells is not None:
-            readings, by_z, mended, steep = self.cells.near(point, True)
-            # formulas of a few numbers: cheaper once more than their slopes
-            steps = np.empty((k + 1, len(READINGS), 3))
-            steps[0] = 0.0
-            steps[1:] = by_z.transpose(2, 0, 1)
-            steps *= _SMALL
-            steps += readings
-            graded = self.weights @ self._graded(steps).T
-            score += graded[:, 0]
-            slopes = graded[:, 1:] - graded[:, :1]
-            slopes *= 1.0 / _SMALL
-            slopes += self.normals
-            _colour_rows(readings, by_z, lab, colours)
-        return Around(score, slopes, lab, colours, mended, steep, likely, uphill)
+        walls, steep = np.zeros(3), np.zeros((3, k))
+        if self.density is not None:
+            likely, uphill = self.density.slope(point)
+            walls[2] = unlikely(likely)
+            np.multiply(uphill, -_THIN, out=steep[2])
+        if self.cells is None:
+            score = self.normals @ point - self.zero
+            return Around(score, self.normals, lab, colours, walls, steep)
+        readings, by_z, walls[:2], steep[:2] = self.cells.near(point, True)
+        # formulas of a few numbers: cheaper once more than their slopes
+        steps = np.empty((k + 1, len(READINGS), 3))
+        _around_readings(readings, by_z, steps)
+        score, slopes = np.empty(len(self.zero)), np.empty((len(self.zero), k))
+        graded = self._graded(steps)
+        _weigh(graded, self.weights, self.normals, self.zero, point, score, slopes)
+        _colour_rows(readings, by_z, lab, colours)
+        return Around(score, slopes, lab, colours, walls, steep)
+
+    def grades(self, z: Float64) -> Float64:
+        """Grades (..., d) of what is read at z (..., k), as decoding mends it."""
+        if self.cells is None:
+            return np.zeros((*z.shape[:-1], 0))
+        points = _plain(z).reshape(-1, z.shape[-1])
+        readings = np.zeros((len(points), len(READINGS), 3))
+        for i, point in enumerate(points):
+            readings[i] = self.cells.near(point, False)[0]
+        return self._graded(readings).reshape(*z.shape[:-1], len(self.used))
 
     def _graded(self, readings: Float64) -> Float64:
         """Grades (m, d) of readings (m, readings, 3)."""
         described = np.empty((len(readings), len(DESCRIPTORS)))
         formulas(readings, described)
         found = np.empty((len(readings), len(self.used)))
-        _interpolate(described, self.used, self.grades.at, self.grades.grade, found)
+        _interpolate(described, self.used, self.at, self.grade, found)
         return found
 
 
@@ -645,8 +688,8 @@ class Task(NamedTuple):
     lobe : what it costs that the lobe gets a hue that all light has not, for log RGB
     together : what it costs that L* of the body changes otherwise than that of all light
     body : linear functions of the coordinates that say how the body looks, which stay
-    least : log density that no move goes below; `-inf` if it does not matter
-    mended : (2,) the most that decoding may mend, as `_near`
+    limits : (3,) the most that may be mended, and how unlikely a point may be, as
+        `Around.walls`; `inf` if it does not matter
     """
 
     moved: NDArray[np.int64]
@@ -661,8 +704,7 @@ class Task(NamedTuple):
     lobe: float
     together: float
     body: Float64
-    least: float
-    mended: Float64
+    limits: Float64
 
     def colour_costs(self, coloured: bool) -> Float64:
         """What changes (_COLOURS,) of `_colour_rows` cost; if not `coloured`, hues may change."""
@@ -689,10 +731,8 @@ class Task(NamedTuple):
         return costs
 
     def drawn(self, lab: Float64, turn: Float64) -> Float64:
-        """What draws (k,) colours (5, 3), of which slopes (15, k) are known, to the one that a move
-        leads to: by a share of what is missing, and no faster than can be followed."""
-        if not self.steered:
-            return np.zeros(turn.shape[1])
+        """What draws (k,) colours (5, 3), of which slopes (15, k) are known, to the one that a
+        steered move leads to: by a share of what is missing, and no faster than can be followed."""
         missing = self.steer * (lab[:, :1] + 16.0) - lab
         missing[:, 0] = np.where(np.arange(len(lab)) < _BODY_OF, self.steer[0] - lab[:, 0], 0.0)
         far = np.sqrt(np.sum(missing * missing, axis=1, keepdims=True))
@@ -858,15 +898,27 @@ STEEP, WALLED, COLOURED = 1, 2, 4
 """Why a move makes less way than asked for: flags of `Flow.why`."""
 
 
+class Part(NamedTuple):
+    """A part of a step: how much of the step is done at its end, the point (k,) and where moved
+    scores (n,) should be there; the form (k, k) and slopes (t, k) of scores at its middle."""
+
+    done: float
+    z: Float64
+    planned: Float64
+    form: Float64
+    slopes: Float64
+
+
 class Knot(NamedTuple):
     """Where a move is: the point (k,), where moved scores (n,) should be, all scores (t,),
-    whether it has met a wall, and how fast (k,) it went last."""
+    whether it has met a wall, how fast (k,) it went last, and in what parts it came there."""
 
     z: Float64
     planned: Float64
     score: Float64
     walled: bool
-    speed: Float64 | None
+    speed: Float64 | None = None
+    parts: tuple[Part, ...] = ()
 
 
 class Flow:
@@ -890,10 +942,11 @@ class Flow:
         self.ground, self.task, self.end = ground, task, end
         around = around or ground.around(z)
         self._kept = around.score[task.held]
-        self._knots = [Knot(z, around.score[task.moved], around.score, False, None)]
+        self._knots = [Knot(z, around.score[task.moved], around.score, False)]
         self._base = ground.stiffness + _BODY * task.body.T @ task.body
         self._by_score = task.score_costs(len(around.score))
         self._by_colour = task.colour_costs(True)
+        self._nowhere = np.zeros(len(z))
         self._idle = 0
         self._start = around
 
@@ -905,19 +958,47 @@ class Flow:
     def to(self, way: float) -> Knot:
         """Where the move is after some way, or where it ends before."""
         while len(self._knots) * STEP <= min(way, self.end) + _HARDLY:
-            knot, rates = self._knots[-1], self.task.rates
-            found = self._advance(len(self._knots) - 1, STEP)
-            made = float((found.planned - knot.planned) @ rates / (rates @ rates))
-            # at a kink a step may come to nothing, and the next one lead on
-            self._idle = self._idle + 1 if made < _STUCK * STEP else 0
-            if self._idle == _PATIENCE:
-                self.end = min(self.end, len(self._knots) * STEP)
-            self._knots.append(found)
+            self._go_on()
         way = min(way, self.end)
         last = len(self._knots) - 1
         done = last if way > last * STEP else int(way / STEP + _HARDLY)
         rest = way - done * STEP
-        return self._advance(done, rest) if rest > _HARDLY else self._knots[done]
+        if rest <= _HARDLY:
+            return self._knots[done]
+        if (done + 1) * STEP > self.end + _HARDLY:
+            return self._advance(done, rest)
+        if done == last:
+            self._go_on()
+        return self._between(done, rest)
+
+    def _go_on(self) -> None:
+        """Go a step further."""
+        knot, rates = self._knots[-1], self.task.rates
+        found = self._advance(len(self._knots) - 1, STEP)
+        made = float((found.planned - knot.planned) @ rates / (rates @ rates))
+        # at a kink a step may come to nothing, and the next one lead on
+        self._idle = self._idle + 1 if made < _STUCK * STEP else 0
+        if self._idle == _PATIENCE:
+            self.end = min(self.end, len(self._knots) * STEP)
+        self._knots.append(found)
+
+    def _between(self, place: int, h: float) -> Knot:
+        """Where the move is between a knot and the next: straight between ends of the parts of that
+        step, and scores are put right."""
+        knot, after = self._knots[place], self._knots[place + 1]
+        walled = knot.walled or after.walled
+        before, z, planned = 0.0, knot.z, knot.planned
+        for part in after.parts:
+            if h < part.done:
+                share = (h - before) / (part.done - before)
+                aim = planned + share * (part.planned - planned)
+                point = z + share * (part.z - z)
+                far = share * _most(part.z - z)
+                score = self.ground.look(point)[0]
+                point, score = self._put_right(point, score, aim, part.form, part.slopes, far)
+                return Knot(point, aim, score, walled)
+            before, z, planned = part.done, part.z, part.planned
+        return after  # no further
 
     def why(self, way: float) -> int:
         """Why it makes less than all of its way there: `STEEP`, `WALLED` and `COLOURED`, added."""
@@ -954,22 +1035,16 @@ class Flow:
     ) -> Float64:
         """The field (k,) of the move at z (k,), of which a step of h shall stay within the walls;
         what it is `shown` as, or what makes it fall short."""
-        task, ground, k = self.task, self.ground, len(z)
-        slopes, gaps = np.empty((3, k)), np.full(3, math.inf)
-        slopes[:2] = around.steep
-        np.multiply(around.uphill, -_THIN, out=slopes[2])
-        low, high = ground.low, ground.high
-        if walled:
-            gaps[:2] = task.mended - around.mended
-            if task.least > -math.inf:
-                gaps[2] = _THIN * (around.likely - task.least)
-        else:
-            low, high = np.full(k, -math.inf), np.full(k, math.inf)
+        task, ground = self.task, self.ground
+        low, high, gaps = ground.low, ground.high, task.limits - around.walls
+        if not walled:
+            low, high, gaps = low - math.inf, high + math.inf, gaps + math.inf
         turn = around.colours[_TURN:_HUES]
         aim = _Aim(around.slopes[task.moved], task.rates)
-        speed = np.empty(k)
+        drawn = task.drawn(around.lab, turn) if task.steered else self._nowhere
+        speed = np.empty(len(z))
         _speed(
-            form, task.drawn(around.lab, turn), aim, _Walls(low, high, slopes, gaps), z, h,
+            form, drawn, aim, _Walls(low, high, around.steep, gaps), z, h,
             turn if shown else turn[:0], speed,
         )  # fmt: skip
         return speed
@@ -983,8 +1058,9 @@ class Flow:
         saves half of the looks at the field; where that misleads, by the velocity here.
         """
         ground, task, some_held = self.ground, self.task, len(self.task.held) > 0
-        z, planned, have, walled, first = self._knots[place]
+        z, planned, have, walled, first, _ = self._knots[place]
         done, step, wary, guessed, at = 0.0, h, h, first is not None, z
+        parts: list[Part] = []
         if first is not None:
             step = min(h, _LONG / max(math.sqrt(first @ first), 1e-30))
             at = self._inside(z, first, 0.5 * step)
@@ -1005,8 +1081,8 @@ class Flow:
             wrong = _most(change[task.moved] - made)
             if some_held:
                 wrong = max(wrong, _most(change[task.held]))
-            over = mended - task.mended
-            if (wrong > _TRUST or max(over[0], over[1]) > _OVER) and (guessed or step > h / _PARTS):
+            over = max((mended - task.limits[:2]).tolist())
+            if (wrong > _TRUST or over > _OVER) and (guessed or step > h / _PARTS):
                 if guessed:
                     first, at, guessed = None, z, False
                 else:
@@ -1016,24 +1092,8 @@ class Flow:
             # what is too far off to be put right: it goes on from there
             lost = np.abs(aim - score[task.moved]) > _LOST
             aim = np.where(lost, score[task.moved], aim)
-            off = self._off(aim, score)
-            for _ in range(_MENDS):
-                if off < _EXACT:
-                    break
-                pull = _WANTED * (aim - score[task.moved]) @ slopes
-                if some_held:
-                    short = self._kept - score[task.held]
-                    pull += _HELD * short @ around.slopes[task.held]
-                put = np.empty(len(z))
-                _least(form, pull, ground.low - after, ground.high - after, put)
-                # no further than a part itself goes: where slopes are faint it would leap
-                put *= min(1.0, 0.5 * step * _most(speed) / max(_most(put), 1e-30))
-                nearer = self._inside(after, put, 1.0)
-                found = ground.look(nearer)[0]
-                left = self._off(aim, found)
-                if left > off:
-                    break
-                after, score, off = nearer, found, left
+            far = step * _most(speed)
+            after, score = self._put_right(after, score, aim, form, around.slopes, far)
             ahead = (score - have)[task.moved] @ task.rates
             astray = some_held and _most(self._kept - score[task.held]) > _ASTRAY
             if astray or ahead < -_FALLS:
@@ -1046,12 +1106,13 @@ class Flow:
                 at = self._inside(z, first, 0.5 * step)
                 continue
             walled = walled or bool(
-                max(over[0], over[1]) > -_OVER
-                or around.likely < task.least + 1.0
+                over > -_OVER
+                or around.walls[2] > task.limits[2] - _THIN
                 or ((after <= ground.low) | (after >= ground.high)).any()
             )
             z, planned, have, first, guessed = after, aim, score, speed, True
             done += step
+            parts.append(Part(done, z, planned, form, around.slopes))
             if h - done <= _HARDLY:
                 break
             # where a part had to be short the next one will be, too
@@ -1059,7 +1120,41 @@ class Flow:
             length = math.sqrt(first @ first)
             step = min(h - done, wary, _LONG / max(length, 1e-30))
             at = self._inside(z, first, 0.5 * step)
-        return Knot(z, planned, have, walled, first if guessed else None)
+        return Knot(z, planned, have, walled, first if guessed else None, tuple(parts))
+
+    def _put_right(
+        self,
+        z: Float64,
+        score: Float64,
+        aim: Float64,
+        form: Float64,
+        slopes: Float64,
+        far: float,
+    ) -> tuple[Float64, Float64]:
+        """A point near z (k,) of scores (t,) where moved scores are at their aim (n,) and held
+        ones where they were, and its scores.
+
+        Along the cheapest way by a form (k, k), with slopes (t, k) of scores, and in no coordinate
+        by more than half as far as the part of a step goes: where slopes are faint it would leap.
+        """
+        ground, task = self.ground, self.task
+        off = self._off(aim, score)
+        for _ in range(_MENDS):
+            if off < _EXACT:
+                break
+            pull = _WANTED * (aim - score[task.moved]) @ slopes[task.moved]
+            if len(task.held):
+                pull += _HELD * (self._kept - score[task.held]) @ slopes[task.held]
+            put = np.empty(len(z))
+            _least(form, pull, ground.low - z, ground.high - z, put)
+            put *= min(1.0, 0.5 * far / max(_most(put), 1e-30))
+            nearer = self._inside(z, put, 1.0)
+            found = ground.look(nearer)[0]
+            left = self._off(aim, found)
+            if left > off:
+                break
+            z, score, off = nearer, found, left
+        return z, score
 
     def _off(self, aim: Float64, score: Float64) -> float:
         """How far moved scores (t,) are off their aim (n,), or held ones off where they were."""

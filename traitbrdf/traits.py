@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from traitbrdf.descriptors import describe_columns, descriptors
+from traitbrdf.descriptors import descriptors
 from traitbrdf.embedding import BRDFEmbedding, Library, default_embedding, default_library
 from traitbrdf.formats import artifact, unknown_name
 from traitbrdf.moves import (
@@ -44,6 +44,7 @@ from traitbrdf.moves import (
     Optics,
     Readings,
     Task,
+    unlikely,
 )
 
 if TYPE_CHECKING:
@@ -267,6 +268,12 @@ class TraitSpace:
         self._synonyms = {
             other: name for name, (_, others) in self.about.items() for other in others
         }
+        self._places = {name: i for i, name in enumerate(self.names)}
+        self._places |= {
+            other: self._places[name]
+            for other, name in self._synonyms.items()
+            if name in self._places
+        }
         self._flows: OrderedDict[Any, tuple[Flow, float]] = OrderedDict()
         self._lock = threading.Lock()
         metric = self.covariance + _RIDGE * np.trace(self.covariance) / k * np.eye(k)
@@ -346,10 +353,9 @@ class TraitSpace:
         ValueError
             On an unknown one, naming near ones.
         """
-        known = self._synonyms.get(name, name)
-        if known not in self.names:
+        if name not in self._places:
             raise ValueError(unknown_name("trait", name, (*self.names, *self._synonyms)))
-        return self.names.index(known)
+        return self._places[name]
 
     def meaning(self, name: str) -> str:
         """One line that says what a trait means."""
@@ -373,8 +379,7 @@ class TraitSpace:
             raise ValueError(
                 "space: expected one that reads descriptors, got straight traits alone"
             )
-        readings = self.optics.readings.at(np.asarray(z, np.float64))
-        return self.optics.grades.of(describe_columns(readings))
+        return self._ground.grades(np.asarray(z, np.float64))
 
     def _raw(self, z: Float64) -> Float64:
         raw: Float64 = z @ self.normals.T
@@ -412,10 +417,10 @@ class TraitSpace:
         --------
         >>> from traitbrdf import default_library, default_traits
         >>> library, space = default_library(), default_traits()
-        >>> z = library.coordinates[library.index("red-rubber")]
+        >>> z = library.coordinates[library.index("blue-plastic")]
         >>> told = space.explain(z, space.move(z, {"shiny": 0.5}))
         >>> [round(score, 2) for score in told.traits["shiny"]]
-        [0.11, 0.61]
+        [0.42, 0.92]
         """
         embedding = default_embedding() if embedding is None else embedding
         points = [self._point(before), self._point(after)]
@@ -470,9 +475,9 @@ class TraitSpace:
         --------
         >>> from traitbrdf import default_library, default_traits
         >>> library, space = default_library(), default_traits()
-        >>> z = library.coordinates[library.index("red-rubber")]
+        >>> z = library.coordinates[library.index("blue-plastic")]
         >>> shinier = space.move(z, {"shiny": 0.5})
-        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 3)
+        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 2)
         0.5
 
         Raises
@@ -528,11 +533,12 @@ class TraitSpace:
             return replace(move, stopped="a straight way ends elsewhere" if missed else "")
         whole = max(abs(value) for value in moved.values())
         with self._lock:
-            flow, room = self._flow(start, moved, held, hold, photoreal)
+            inside = np.minimum(np.maximum(start, self.low), self.high)
+            flow, room = self._flow(inside, moved, held, hold, photoreal)
             found = flow.to(whole)
             # a start outside of the box has another score than where its way begins
-            inside = np.all((start >= self.low) & (start <= self.high))
-            change = found.score - (flow.score if inside else self._ground.look(start)[0])
+            outside = (inside != start).any()
+            change = found.score - (self._ground.look(start)[0] if outside else flow.score)
             move = self._said(found.z, change, moved, held, found.walled)
             off = max(abs(move.asked[name] - move.reached[name]) for name in move.asked)
             if off <= _NEAR:
@@ -591,16 +597,16 @@ class TraitSpace:
 
     def _flow(
         self,
-        start: Float64,
+        inside: Float64,
         moved: Mapping[int, float],
         held: list[int],
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> tuple[Flow, float]:
-        """The flow of a move, as far as it is known, and how far its scores may go."""
+        """The flow of a move from a point of the box, as far as it is known, and how far its scores
+        may go."""
         whole = max(abs(value) for value in moved.values())
         rates = {i: value / whole for i, value in moved.items()}
-        inside = np.clip(start, self.low, self.high)
         key = (inside.tobytes(), tuple(rates.items()), tuple(held), hold, photoreal)
         if key in self._flows:
             self._flows.move_to_end(key)
@@ -633,38 +639,41 @@ class TraitSpace:
         """The move from a point of the box."""
         known = np.abs(self.related[list(rates)])
         apart = np.setdiff1d(np.flatnonzero((known < RELATED).all(axis=0)), [*rates, *held])
-        least = -math.inf
-        if photoreal and self.density is not None:
-            limit = float(np.interp(PLAUSIBLE, _PERCENT, self.density.known))
+        limits = np.full(3, math.inf)
+        if photoreal:
+            if self.optics is not None:
+                limits[:2] = _HOLE, 0.0
+            if self.density is not None:
+                rare = float(np.interp(PLAUSIBLE, _PERCENT, self.density.known))
+                limits[2] = unlikely(rare)
             # members at the rim may stay as unlikely as they are
-            least = min(limit, around.likely)
-        free = not photoreal or self.optics is None
-        mends = np.full(2, math.inf) if free else np.maximum(around.mended, [_HOLE, 0.0])
-        moved = {self.names[i] for i in rates}
+            limits = np.maximum(limits, around.walls)
+        names = {self.names[i] for i in rates}
         colour = float(self.optics is not None and ("colour" in hold or "color" in hold))
-        bodily = float(self.optics is not None and "body" not in hold and bool(moved & KEEPS_BODY))
+        bodily = float(self.optics is not None and "body" not in hold and bool(names & KEEPS_BODY))
         light = float(self.optics is not None and "lightness" in hold)
-        paling = bool(moved & PALING)
-        steered = [name for name in moved if name in STEERED] if len(moved) == 1 else []
-        ints = (np.array([*some], np.int64) for some in (rates, held, apart))
-        which, stay, others = ints
+        paling = bool(names & PALING)
+        steered = [name for name in names if name in STEERED] if len(names) == 1 else []
+        # by surface: light at 10, 30 and 60 degrees, the body, and the body lit from the side
+        hue = colour * _HUE * np.array([1.0, 1.0, 1.0, 1.0, 0.3])
+        chroma = colour * (0.0 if paling else _CHROMA) * np.array([1.0, 1.0, 1.0, 0.1, 1.0])
+        chroma += bodily * _CHROMA * np.array([0.0, 0.0, 0.0, 0.3, 0.0])
+        lightness = light * _LIGHTNESS * np.array([1.0, 1.0, 1.0, 0.0, 0.3])
+        lightness += bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 3.0, 0.0])
         return Task(
-            which,
-            np.array([*rates.values()]),
-            stay,
-            others,
-            colour * _HUE * np.array([1.0, 1.0, 1.0, 1.0, 0.3]),
-            colour * (0.0 if paling else _CHROMA) * np.array([1.0, 1.0, 1.0, 0.1, 1.0])
-            + bodily * _CHROMA * np.array([0.0, 0.0, 0.0, 0.3, 0.0]),
-            light * _LIGHTNESS * np.array([1.0, 1.0, 1.0, 0.0, 0.3])
-            + bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 3.0, 0.0]),
-            bool(steered),
-            np.array(STEERED[steered[0]] if steered else (0.0, 0.0, 0.0)),
-            colour * _LOBE,
-            _LIGHTNESS * float("bright" in moved),
-            self.body if "body" in hold else self.body[:0],
-            least,
-            mends,
+            moved=np.array([*rates], np.int64),
+            rates=np.array([*rates.values()]),
+            held=np.array(held, np.int64),
+            apart=apart.astype(np.int64),
+            hue=hue,
+            chroma=chroma,
+            light=lightness,
+            steered=bool(steered),
+            steer=np.array(STEERED[steered[0]] if steered else (0.0, 0.0, 0.0)),
+            lobe=colour * _LOBE,
+            together=_LIGHTNESS * float("bright" in names),
+            body=self.body if "body" in hold else self.body[:0],
+            limits=limits,
         )
 
     def _reason(
