@@ -1076,6 +1076,9 @@ class Flow:
             slopes = around.slopes[task.moved]
             made = step * (slopes @ speed)
             aim, after = planned + made, self._inside(z, speed, step)
+            if task.steered:  # the colour may draw it on faster than asked for
+                whole = planned + step * task.rates
+                aim = np.where(task.rates > 0.0, np.minimum(aim, whole), np.maximum(aim, whole))
             score, _, mended = ground.look(after)
             change = score - have
             wrong = _most(change[task.moved] - made)
