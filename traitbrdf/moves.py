@@ -318,7 +318,8 @@ def _near(
     `raised` and `source` (3, cells) become f + FLOOR, and the cells of which it is."""
     rows, columns = cells.rows, cells.columns
     k, count, first = len(z), len(value), len(value) - cells.angles
-    for a in range(3):
+    three = value.shape[1]  # no constant: loops that are unrolled take longer to compile
+    for a in range(three):
         for n in range(len(cells.mean)):
             raised[a, n] = 0.0
         for j in range(cells.spans[a, 0], cells.spans[a, 1]):
@@ -326,11 +327,11 @@ def _near(
                 raised[a, n] += z[j] * cells.turned[a, j, n]
     for n in range(len(cells.mean)):
         x, y, w = raised[0, n], raised[1, n], raised[2, n]
-        for c in range(3):
+        for c in range(three):
             raised[c, n] = (
                 cells.mean[n] + OPPONENT[0, c] * x + OPPONENT[1, c] * y + OPPONENT[2, c] * w
             )
-    for c in range(3):
+    for c in range(three):
         for n in range(len(cells.mean)):
             source[c, n] = n
             # exp as 64th power of its series: a library's is called for each cell alone, which
@@ -351,7 +352,7 @@ def _near(
     for i in range(len(columns)):
         light = 0.0
         for j in range(columns.shape[1]):
-            for c in range(3):
+            for c in range(three):
                 light += LUMINANCE[c] * raised[c, columns[i, j]]
         if i == 0:
             middle = light
@@ -360,53 +361,47 @@ def _near(
     mended[0] = math.log(most / middle)
     if len(slopes) > 0 and brightest > 0:
         for j in range(columns.shape[1]):
-            for c in range(3):
+            for c in range(three):
                 bright, dark = columns[brightest, j], columns[0, j]
                 up = LUMINANCE[c] * raised[c, bright] / most
                 down = LUMINANCE[c] * raised[c, dark] / middle
                 for m in range(k):
                     steep[0, m] += up * rows[c, bright, m] - down * rows[c, dark, m]
     # no hole in the highlight: as high as what follows, of which it then has the slope too
-    for c in range(3):
+    for c in range(three):
         for j in range(columns.shape[1]):
             for i in range(len(columns) - 2, -1, -1):
                 n, after = columns[i, j], columns[i + 1, j]
                 if raised[c, n] < raised[c, after]:
                     raised[c, n], source[c, n] = raised[c, after], source[c, after]
     for i in range(count):
-        end = cells.starts[i + 1]
-        for p in range(cells.starts[i], end, 2):
-            # two at once: each pass through the slopes takes as long as what is added there
+        for p in range(cells.starts[i], cells.starts[i + 1]):
             n, weight = cells.which[p], cells.weights[p]
-            two = min(p + 1, end - 1)
-            other, its_weight = cells.which[two], cells.weights[two] if p + 1 < end else 0.0
             for c in range(3):
                 value[i, c] += weight * max(raised[c, n] - FLOOR, 0.0)
-                value[i, c] += its_weight * max(raised[c, other] - FLOOR, 0.0)
                 if len(slopes) > 0:
                     by, s = weight * raised[c, n], source[c, n]
-                    its, t = its_weight * raised[c, other], source[c, other]
                     for m in range(k):
-                        slopes[i, c, m] += by * rows[c, s, m] + its * rows[c, t, m]
+                        slopes[i, c, m] += by * rows[c, s, m]
     whole, angle, colour, norm = 1e-9, first, 0, 0.0
     for i in range(first, count):
-        for c in range(3):
+        for c in range(three):
             if value[i, c] > whole:
                 whole, angle, colour = value[i, c], i, c
     for i in range(first, count):
-        for c in range(3):
+        for c in range(three):
             norm += (value[i, c] / whole) ** _POWER
     mended[1] = math.log(whole) + math.log(max(norm, 1.0)) / _POWER
     if len(slopes) > 0:
         for i in range(first, count):
-            for c in range(3):
+            for c in range(three):
                 part = (value[i, c] / whole) ** _POWER / norm
                 if part > 1e-3:
                     for m in range(k):
                         steep[1, m] += part / max(value[i, c], 1e-9) * slopes[i, c, m]
     if whole > 1.0:  # no more light than there was
         for i in range(first):
-            for c in range(3):
+            for c in range(three):
                 value[i, c] /= whole
                 if len(slopes) > 0:
                     for m in range(k):
@@ -436,13 +431,13 @@ _TURN, _HUES, _GREYS, _CHROMAS, _LOBES, _BESIDE, _COLOURS = 0, 15, 20, 30, 40, 4
 def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
     """Fill in CIELAB (5, 3) of `SURFACES` and how it changes, functions (_COLOURS, k) of a
     velocity, of readings (readings, 3) and their slopes (readings, 3, k)."""
-    k = by_z.shape[2]
+    k, three = by_z.shape[2], by_z.shape[1]
     f, by = np.empty(lab.shape[1]), np.empty(lab.shape[1])
     for i in range(len(_SEEN_AT)):
         at, whole = _SEEN_AT[i], _WHOLE[i, 0]
-        for j in range(3):
+        for j in range(three):
             x = 1e-9
-            for c in range(3):
+            for c in range(three):
                 x += WHITE[j, c] * whole * max(readings[at, c], 0.0)
             cube = x > (6 / 29) ** 3
             f[j] = x ** (1 / 3) if cube else x * (29 / 6) ** 2 / 3 + 4 / 29
@@ -470,7 +465,7 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
     # a lobe may take on the hue of all light, or lose it, but gets no other. Hues are logarithms
     # of red over blue and of green over both
     x = y = along_x = along_y = 0.0
-    for c in range(3):
+    for c in range(three):
         log = math.log(max(readings[_SEEN_AT[1], c], 0.0) + 1e-2)
         x += OPPONENT[1, c] * log
         y += OPPONENT[2, c] * log
@@ -482,7 +477,7 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
     grey = max(_TINGED / size, 1.0 / (1.0 + math.exp(min(along / 0.02, 50.0))))
     for n in range(k):
         by_x = by_y = 0.0
-        for c in range(3):
+        for c in range(three):
             by_x += OPPONENT[1, c] * by_z[_PEAK_AT, c, n] * by[c]
             by_y += OPPONENT[2, c] * by_z[_PEAK_AT, c, n] * by[c]
         rows[_LOBES, n] = (x * by_y - y * by_x) / size
@@ -828,10 +823,10 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
     speed, and fades where nothing leads on. If there are slopes `turn` (15, k) of colours, it is
     made as fast as asked for where that is near, and no faster than can be followed.
     """
-    k, count = len(z), len(aim.rates)
+    k, count, three = len(z), len(aim.rates), len(walls.gaps)
     low, high, drawn, rates = np.empty(k), np.empty(k), np.empty(k), np.empty(count)
     stiff, at_wall = np.empty((k, k)), np.empty(len(walls.gaps))
-    for i in range(3):
+    for i in range(three):
         at_wall[i] = 0.0
     for n in range(k):
         low[n] = min((walls.low[n] - z[n]) / h, 0.0)
@@ -847,7 +842,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
                 drawn[n] += _WANTED * rates[i] * aim.slopes[i, n]
             for m in range(k):
                 stiff[n, m] = form[n, m]
-        for i in range(3):
+        for i in range(three):
             if at_wall[i] > 0.0:
                 back = _WALL * max(walls.gaps[i], -_BACK) / h
                 for n in range(k):
@@ -857,7 +852,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
                         stiff[n, m] += some * walls.slopes[i, m]
         _least(stiff, drawn, low, high, out)
         more = False
-        for i in range(3):
+        for i in range(three):
             if at_wall[i] == 0.0 and walls.gaps[i] < math.inf:
                 ahead = 0.0
                 for n in range(k):
@@ -879,7 +874,7 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
     shown = length = 0.0
     for i in range(len(turn) // 3):
         square = 0.0
-        for j in range(3):
+        for j in range(three):
             change = 0.0
             for n in range(k):
                 change += turn[3 * i + j, n] * out[n]
