@@ -11,8 +11,8 @@ from pathlib import Path
 from data_gen.packing import COMPONENTS, COUNT, SEED, build
 from data_gen.study import CANDIDATES, study, table, trait_table
 from data_gen.tables import Tables
-from traitbrdf.embedding import GRID
-from traitbrdf.formats import write_arrays
+from traitbrdf.formats.files import write_arrays
+from traitbrdf.space.embedding import GRID
 
 _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "library.npz"
 

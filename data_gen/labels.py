@@ -2,9 +2,9 @@
 
 Never from the parameters of the recipes, and never from ratings: what a table looks like decides,
 so that a measured material would get the same label. A descriptor is graded by how common its value
-is among the members (`traitbrdf.moves.Grades`), which makes different units comparable; a trait's
-grade is a weighted sum of those. Names are the 16 of Matusik et al. 2003 and the 14 of Serrano et
-al. 2016, and "shiny".
+is among the members (`traitbrdf.space.scores.Grades`), which makes different units comparable; a
+trait's grade is a weighted sum of those. Names are the 16 of Matusik et al. 2003 and the 14 of
+Serrano et al. 2016, and "shiny".
 """
 
 from __future__ import annotations

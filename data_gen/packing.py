@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from data_gen.families import materials
 from data_gen.labels import TRAITS, grading, labels
 from data_gen.tables import Progress, Tables
-from traitbrdf.brdf import ALBEDO_ANGLES, albedo_operator
-from traitbrdf.descriptors import PROFILE, READINGS, describe, read, reading_rows
-from traitbrdf.embedding import GRID, BRDFEmbedding, channel_logs
-from traitbrdf.moves import Grades, Optics, Readings
-from traitbrdf.profiles import HIGHLIGHT
-from traitbrdf.traits import TraitSpace
+from traitbrdf.recipes.materials import materials
+from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
+from traitbrdf.reflectance.descriptors import PROFILE, READINGS, describe, read, reading_rows
+from traitbrdf.space.embedding import GRID, BRDFEmbedding
+from traitbrdf.space.highlights import HIGHLIGHT
+from traitbrdf.space.logmap import channel_logs
+from traitbrdf.space.scores import Grades, Optics, Readings
+from traitbrdf.space.traits import TraitSpace
 
 COUNT = 2040
 SEED = 0
@@ -38,7 +39,7 @@ def build(
 
     Parameters
     ----------
-    count, seed : as for `data_gen.families.materials`
+    count, seed : as for `traitbrdf.recipes.materials.materials`
     components : as for `BRDFEmbedding`
     progress : called with (stage, fraction); may raise to stop
     folder : where tables are kept while they are needed, and after an interruption: 0.24 MB a

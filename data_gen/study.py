@@ -19,22 +19,26 @@ from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.utils.extmath import randomized_svd
 
-from data_gen.families import materials
 from data_gen.labels import TRAITS, labels
 from data_gen.tables import Progress, table_of
-from traitbrdf.bench import RENDERED_UNDER, MeasuredSet, decibels, measured_sets
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.descriptors import DESCRIPTORS
-from traitbrdf.embedding import FLOOR, GRID, OPPONENT, default_library
-from traitbrdf.formats import encode_srgb
-from traitbrdf.gallery import own_colours
-from traitbrdf.lights import EnvironmentMap
-from traitbrdf.measured import MeasuredBRDF
-from traitbrdf.scene import Scene
-from traitbrdf.shapes import sphere
-from traitbrdf.trait_laws import spearman
-from traitbrdf.traits import RELATED, default_traits, straight
-from traitbrdf.transport import Operator
+from traitbrdf.bench.datasets import MeasuredSet, measured_sets
+from traitbrdf.bench.embedding import RENDERED_UNDER
+from traitbrdf.bench.metrics import decibels
+from traitbrdf.bench.people import spearman
+from traitbrdf.formats.display import encode_srgb
+from traitbrdf.pictures import own_colours
+from traitbrdf.recipes.materials import materials
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.descriptors import DESCRIPTORS
+from traitbrdf.reflectance.measured import MeasuredBRDF
+from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import sphere
+from traitbrdf.space.embedding import GRID
+from traitbrdf.space.library import default_library
+from traitbrdf.space.logmap import FLOOR, OPPONENT
+from traitbrdf.space.traits import RELATED, default_traits, straight
+from traitbrdf.transport.operator import Operator
 
 Float64: TypeAlias = NDArray[np.float64]
 Float32: TypeAlias = NDArray[np.float32]

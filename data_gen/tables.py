@@ -17,10 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_gen import families, spectra
-from traitbrdf import brdf, models
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.formats import atomic_path
+from traitbrdf.formats.files import atomic_path
+from traitbrdf.recipes import anchors, families, looks, spectra
+from traitbrdf.recipes import materials as recipe
+from traitbrdf.recipes.looks import Material
+from traitbrdf.recipes.materials import materials
+from traitbrdf.reflectance import brdf, models
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
 
 PIECE = 60
 """Members of a piece: 14 MB on the grid of the library."""
@@ -28,7 +31,7 @@ PIECE = 60
 Progress = Callable[[str, float], None]
 
 
-def table_of(material: families.Material, grid: HalfDiffGrid) -> TabulatedBRDF:
+def table_of(material: Material, grid: HalfDiffGrid) -> TabulatedBRDF:
     """A member's table, of albedo 1 at most."""
     table = TabulatedBRDF.from_model(material.model, grid, material.name)
     # interpolating a sharp lobe can add a percent of energy that its closed form has not
@@ -40,7 +43,7 @@ def table_of(material: families.Material, grid: HalfDiffGrid) -> TabulatedBRDF:
 
 def write_piece(path: str, seed: int, start: int, stop: int, grid: HalfDiffGrid) -> str:
     """Write the tables (stop - start, *grid.shape, 3) float32 of some members; its path."""
-    values = [table_of(material, grid).values for material in families.materials(seed, stop, start)]
+    values = [table_of(material, grid).values for material in materials(seed, stop, start)]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.save(file, np.stack(values).astype(np.float32))
     return path
@@ -52,12 +55,12 @@ class Tables:
     Parameters
     ----------
     folder : where the pieces are; made if it does not exist
-    count, seed : as for `families.materials`
+    count, seed : as for `traitbrdf.recipes.materials.materials`
     grid : HalfDiffGrid
     """
 
     def __init__(self, folder: Path, count: int, seed: int, grid: HalfDiffGrid) -> None:
-        known = list(families.materials(seed, count))  # bad numbers end here
+        known = list(materials(seed, count))  # bad numbers end here
         self.names, self.families = [m.name for m in known], [m.family for m in known]
         self.count, self.seed, self.grid = count, seed, grid
         self.folder = folder
@@ -129,6 +132,6 @@ class Tables:
 def _key(seed: int, grid: HalfDiffGrid) -> str:
     """What tables depend on: other recipes or models make other files."""
     digest = hashlib.sha256(repr((seed, grid)).encode())
-    for module in (families, spectra, models, brdf):
+    for module in (looks, families, anchors, recipe, spectra, models, brdf):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:12]

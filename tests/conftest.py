@@ -9,14 +9,25 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # processes that share the cores would wait for each other's threads
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
 import numpy as np
 import pytest
+from hypothesis import settings
 
-from traitbrdf.embedding import default_embedding, default_library
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import sphere, teapot
-from traitbrdf.transport import Training, training_tables
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import sphere
+from traitbrdf.scene.teapot import teapot
+from traitbrdf.space.library import default_embedding, default_library
+from traitbrdf.transport.basis import Training, training_tables
+
+settings.register_profile("laws", deadline=None)  # how long a law takes is no law
+settings.load_profile("laws")
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8")
 

@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf import formats
-from traitbrdf.brdf import (
+from traitbrdf.directions import fold_phi_d, from_half_diff_angles
+from traitbrdf.formats.brdfs import write_merl
+from traitbrdf.formats.files import FormatError
+from traitbrdf.reflectance.brdf import (
     ALBEDO_ANGLES,
     HalfDiffGrid,
     TabulatedBRDF,
@@ -19,8 +21,7 @@ from traitbrdf.brdf import (
     albedo_operator,
     hemisphere_nodes,
 )
-from traitbrdf.directions import fold_phi_d, from_half_diff_angles
-from traitbrdf.models import GGX, BoundedPhong, Lambert, PerfectMirror, Sheen
+from traitbrdf.reflectance.models import GGX, BoundedPhong, Lambert, PerfectMirror, Sheen
 
 HALF_PI = math.pi / 2
 FOLDED = HalfDiffGrid(9, 7, 5)
@@ -320,7 +321,7 @@ def test_merl_files_keep_values_and_peak(tmp_path):
 def test_reading_turns_invalid_cells_to_zero(tmp_path):
     values = np.random.default_rng(0).random((3, 4, 6, 3))
     values[0, 1] = -1.0
-    formats.write_merl(tmp_path / "a.binary", values)
+    write_merl(tmp_path / "a.binary", values)
     brdf = TabulatedBRDF.read(tmp_path / "a.binary")
     assert brdf.grid == HalfDiffGrid(3, 4, 6, "merl")
     np.testing.assert_array_equal(brdf.values[0, 1], 0.0)
@@ -331,7 +332,7 @@ def test_reading_refuses_files_that_are_no_table(tmp_path):
     with pytest.raises(FileNotFoundError):
         TabulatedBRDF.read(tmp_path / "none.binary")
     (tmp_path / "thin.binary").write_bytes(struct.pack("<3i", 1, 2, 2) + bytes(24 * 4))
-    with pytest.raises(formats.FormatError, match="2 nodes an axis"):
+    with pytest.raises(FormatError, match="2 nodes an axis"):
         TabulatedBRDF.read(tmp_path / "thin.binary")
 
 

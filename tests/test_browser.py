@@ -10,8 +10,8 @@ import pytest
 from chrome import CHROMIUM, FLAGS, KERNEL_IDLE, RUN_ALL, STUDIO, jupyter_lab, write_notebook
 
 import traitbrdf as tb
-from traitbrdf import editing
-from traitbrdf.strokes import follow
+from traitbrdf.design.strokes import follow
+from traitbrdf.session import preparation
 from traitbrdf.studio.page import Server
 from traitbrdf.studio.session import Session
 
@@ -201,7 +201,7 @@ def paint_and_more(driver, folder):
 
 
 def test_the_page(page, tmp_path, training, monkeypatch):
-    monkeypatch.setattr(editing, "_training", lambda library, seed: training)
+    monkeypatch.setattr(preparation, "training_of", lambda library, seed: training)
     edit = example()
     session = Session(edit, tmp_path)
     server = Server(session)

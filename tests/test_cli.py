@@ -12,9 +12,15 @@ import pytest
 from PIL import Image
 
 import traitbrdf as tb
-from traitbrdf import bench, peers, trait_laws
+from traitbrdf.bench import datasets, peers
+from traitbrdf.bench.datasets import HELD_OUT, unseen
+from traitbrdf.bench.edits import _frame_error, _peak_memory
+from traitbrdf.bench.oracle import Oracle, draw_fragments, reference_values
+from traitbrdf.bench.records import ON_REQUEST, Record
+from traitbrdf.bench.rivals import texel_sum, texel_sum_torch
+from traitbrdf.bench.run import BENCHES
 from traitbrdf.cli import main
-from traitbrdf.formats import read_image, write_exr
+from traitbrdf.formats.images import read_image, write_exr
 
 MAPS = ("forest", "lobby", "night", "studio", "sunset", "venice", "warehouse", "workshop")
 
@@ -67,6 +73,7 @@ def test_demo_under_real_maps(
     assert "% of what was asked" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_paint_writes_a_picture_and_a_design(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -83,6 +90,7 @@ def test_paint_writes_a_picture_and_a_design(
     np.testing.assert_array_equal(session.render(), read_image(again))
 
 
+@pytest.mark.slow
 def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As a flag, with a radius, or none; it is a part of its own and saved with the design."""
 
@@ -116,6 +124,7 @@ def test_the_demo_stands_on_the_ground(tmp_path: Path) -> None:
     assert report["demo"]["changed_outside"] == 0
 
 
+@pytest.mark.slow
 def test_render_by_the_oracle_agrees(tmp_path: Path) -> None:
     fast, slow = tmp_path / "fast.exr", tmp_path / "slow.exr"
     common = ["render", "--shape", "sphere", "--size", "8", "--material", "red-rubber"]
@@ -192,10 +201,10 @@ def test_bench_writes_records(
 
 
 def test_record_says_when_a_target_is_missed() -> None:
-    assert bench.Record.at_most("x", 1.0, "%", 2.0).met is True
-    assert bench.Record.at_least("x", 1.0, "dB", 2.0).met is False
-    assert bench.Record.at_least("x", 2.0, "dB", 2.0).met is True
-    missed = bench.Record.at_most("x", 3.0, "%", 2.0)
+    assert Record.at_most("x", 1.0, "%", 2.0).met is True
+    assert Record.at_least("x", 1.0, "dB", 2.0).met is False
+    assert Record.at_least("x", 2.0, "dB", 2.0).met is True
+    missed = Record.at_most("x", 3.0, "%", 2.0)
     assert missed.met is False
     assert "MISSED" in missed.line()
 
@@ -204,8 +213,8 @@ def test_texel_sum_is_the_reference_for_a_rough_surface() -> None:
     scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=64), size=8, subsamples=1)
     brdf = tb.default_library()["white-plaster"]
     index = np.arange(0, len(scene.pixels), 7)
-    plain = bench.texel_sum(scene, index, brdf)
-    true, _ = bench.reference_values(scene, index, [brdf], 1e-4)
+    plain = texel_sum(scene, index, brdf)
+    true, _ = reference_values(scene, index, [brdf], 1e-4)
     assert tb.reference.relative_error(plain, true[:, 0]) < 2e-3
 
 
@@ -214,39 +223,40 @@ def test_the_texel_sum_in_torch_is_that_in_numpy() -> None:
     index = np.flatnonzero(~scene.bordering)[::3]
     for name in ("gold-polished", "blue-plastic"):
         brdf = tb.default_library()[name]
-        plain = bench.texel_sum(scene, index, brdf)
-        other = bench.texel_sum_torch(scene, index, brdf)
+        plain = texel_sum(scene, index, brdf)
+        other = texel_sum_torch(scene, index, brdf)
         np.testing.assert_allclose(other, plain, rtol=1e-3)
     merl = tb.TabulatedBRDF(tb.HalfDiffGrid(4, 4, 4, "merl"), np.ones((4, 4, 4, 3)))
     with pytest.raises(ValueError, match="folded"):
-        bench.texel_sum_torch(scene, index, merl)
+        texel_sum_torch(scene, index, merl)
 
 
 def test_unseen_tables_are_new() -> None:
-    kinds = bench.unseen(None, quick=True)
+    kinds = unseen(None, quick=True)
     assert {"held-out library", "new recipes", "manifold moves", "models"} <= set(kinds)
     library = tb.default_library()
     known = [library[name].values for name in library.names]
     for table in kinds["new recipes"]:
         assert min(float(np.abs(values - table.values).max()) for values in known) > 1e-3
-    held = {library.names[i] for i in range(0, len(library), bench.HELD_OUT)}
+    held = {library.names[i] for i in range(0, len(library), HELD_OUT)}
     assert {table.name for table in kinds["held-out library"]} <= held
 
 
 def test_without_the_recipe_there_are_more_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    with_recipes = bench.unseen(None, quick=True)
-    monkeypatch.setattr(bench, "fresh_recipes", lambda count, seed=1: [])
-    without = bench.unseen(None, quick=True)
+    with_recipes = unseen(None, quick=True)
+    monkeypatch.setattr(datasets, "fresh_recipes", lambda count, seed=1: [])
+    without = unseen(None, quick=True)
     assert "new recipes" not in without
     assert sum(map(len, without.values())) == sum(map(len, with_recipes.values()))
 
 
+@pytest.mark.slow
 def test_the_oracle_on_several_cores_is_the_same() -> None:
     scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=12, subsamples=2)
     brdfs = [tb.default_library()[name] for name in ("white-plaster", "gold-satin")]
     index = np.arange(0, len(scene.pixels), len(scene.pixels) // 40)
     assert len(index) >= 32  # fewer are not shared out
-    values, errors = bench.reference_values(scene, index, brdfs, 1e-2)
+    values, errors = reference_values(scene, index, brdfs, 1e-2)
     expected = tb.reference.fragments(scene, index, brdfs, 1e-2)
     np.testing.assert_array_equal(values, expected[0])
     np.testing.assert_array_equal(errors, expected[1])
@@ -262,16 +272,17 @@ def test_what_the_oracle_refuses_is_replaced(monkeypatch: pytest.MonkeyPatch) ->
         return whole(scene, index, brdfs, tolerance)
 
     monkeypatch.setattr(tb.reference, "fragments", picky)
-    oracle = bench.Oracle([tb.default_library()["white-plaster"]], 1e-2, cores=1)
+    oracle = Oracle([tb.default_library()["white-plaster"]], 1e-2, cores=1)
     every = np.arange(len(scene.pixels))
     values, _ = oracle(scene, every)
     np.testing.assert_array_equal(np.isnan(values).any(axis=(1, 2)), every % 7 == 0)
-    index, known, _ = bench._drawn(oracle, scene, every, 20, np.random.default_rng(0))
+    index, known, _ = draw_fragments(oracle, scene, every, 20, np.random.default_rng(0))
     assert np.isfinite(known).all()
     assert not np.any(index % 7 == 0)
     np.testing.assert_array_equal(known, values[index])
 
 
+@pytest.mark.slow
 def test_frame_errors_are_those_of_whole_pixels() -> None:
     """Against the oracle's own picture, borders and backdrop included."""
     scene = tb.Scene(
@@ -281,7 +292,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
     session = tb.EditSession(scene, quality="preview")
     session.assign("sphere", "white-plaster")
     frame = session.render()
-    stated = bench._frame_error(session, len(scene.pixels), np.random.default_rng(0))
+    stated = _frame_error(session, len(scene.pixels), np.random.default_rng(0))
     brdfs = {name: session.brdf(name) for name in scene.parts}
     true = tb.reference.render(scene, brdfs, 1e-3).reshape(-1, 3)
     backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
@@ -294,7 +305,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
 
 
 def test_peak_memory() -> None:
-    peak = bench._peak_memory()
+    peak = _peak_memory()
     assert peak is None or 0.05 < peak < 100.0
 
 
@@ -351,18 +362,17 @@ def test_bench_beside_mitsuba_says_what_is_missing(
 
 def test_mitsuba_is_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[str] = []
-    for name in bench.BENCHES:
+    for name in BENCHES:
 
-        def noted(*_: object, name: str = name) -> Iterator[bench.Record]:
+        def noted(*_: object, name: str = name) -> Iterator[Record]:
             """Nothing is measured."""
             called.append(name)
             return iter(())
 
-        monkeypatch.setitem(bench.BENCHES, name, noted)
-    monkeypatch.setattr(trait_laws, "trait_laws", lambda *_: iter(()))  # minutes of work
+        monkeypatch.setitem(BENCHES, name, noted)
     assert main(["bench"]) == 0
     assert "edit" in called
-    assert not bench.ON_REQUEST & set(called)
+    assert not ON_REQUEST & set(called)
     for arguments in (["--peers"], ["peers"], ["peers", "--peers"]):
         called.clear()
         assert main(["bench", *arguments]) == 0

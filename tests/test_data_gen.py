@@ -13,19 +13,24 @@ import numpy as np
 import pytest
 
 from data_gen import __main__ as command
-from data_gen import families, packing, spectra, study, tables
-from data_gen.families import FAMILIES, METALS, materials
+from data_gen import packing, study, tables
 from data_gen.labels import TRAITS, grading, labels
 from data_gen.packing import build
 from data_gen.tables import table_of
-from traitbrdf.bench import MeasuredSet
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.descriptors import DESCRIPTORS, descriptors
-from traitbrdf.embedding import FLOOR, GRID, BRDFEmbedding, default_library
-from traitbrdf.formats import artifact, read_arrays
-from traitbrdf.lights import EnvironmentMap
-from traitbrdf.models import GGX, Lambert, Plastic, fresnel_conductor
-from traitbrdf.traits import TraitSpace
+from traitbrdf.bench.datasets import MeasuredSet
+from traitbrdf.formats.files import artifact, read_arrays
+from traitbrdf.recipes import families, spectra
+from traitbrdf.recipes.families import FAMILIES
+from traitbrdf.recipes.looks import DIGITS, METALS
+from traitbrdf.recipes.materials import materials
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.descriptors import DESCRIPTORS, descriptors
+from traitbrdf.reflectance.models import GGX, Lambert, Plastic, fresnel_conductor
+from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.embedding import GRID, BRDFEmbedding
+from traitbrdf.space.library import default_library
+from traitbrdf.space.logmap import FLOOR
+from traitbrdf.space.traits import TraitSpace
 
 ROOT = Path(__file__).resolve().parents[1]
 COARSE = HalfDiffGrid(45, 12, 5)
@@ -210,7 +215,8 @@ def drawn_here():
 def test_the_recipe_is_the_same_on_every_processor(drawn_here, setting):
     script = f"""
 import json
-from data_gen.families import METALS, materials
+from traitbrdf.recipes.looks import METALS
+from traitbrdf.recipes.materials import materials
 from data_gen.packing import COUNT, SEED
 drawn = [*materials(SEED, COUNT), *materials{OTHERS}]
 print(json.dumps([dict(METALS), [(m.name, m.family, m.parameters) for m in drawn]]))
@@ -254,7 +260,7 @@ def test_the_last_digit_of_what_a_processor_reckons_does_not_matter(drawn_here, 
 def test_parameters_have_few_digits():
     for member in materials(3, 340):
         for value in np.concatenate([np.ravel(v) for v in member.parameters.values()]):
-            assert value == float(f"{value:.{families.DIGITS}g}")
+            assert value == float(f"{value:.{DIGITS}g}")
 
 
 @pytest.mark.slow
@@ -264,7 +270,7 @@ def test_a_fit_decodes_to_the_same_on_every_processor(small, tmp_path, setting):
 import sys
 from pathlib import Path
 from data_gen.packing import build
-from traitbrdf.formats import write_arrays
+from traitbrdf.formats.files import write_arrays
 write_arrays(Path(sys.argv[1]), build(30, seed=3, components=(4, 4)))
 """
     path = tmp_path / "elsewhere.npz"

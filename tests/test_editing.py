@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from concurrent.futures import CancelledError
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,16 +19,33 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import traitbrdf as tb
-from traitbrdf import editing, promises
-from traitbrdf.descriptors import cielab, hue
-from traitbrdf.editing import EditSession
-from traitbrdf.formats import FormatError, read_arrays, write_arrays
-from traitbrdf.gallery import angle_map
-from traitbrdf.models import GGX, Lambert, PerfectMirror
-from traitbrdf.shapes import Mesh
-from traitbrdf.strokes import Stroke, follow
-from traitbrdf.traits import Trait, default_traits
-from traitbrdf.transport import Training, Transport
+from traitbrdf.design.strokes import Stroke, follow
+from traitbrdf.formats.files import FormatError, read_arrays, write_arrays
+from traitbrdf.pictures import angle_map
+from traitbrdf.reflectance.descriptors import cielab, hue
+from traitbrdf.reflectance.models import GGX, Lambert, PerfectMirror
+from traitbrdf.scene.shapes import Mesh
+from traitbrdf.session import budget as promises
+from traitbrdf.session import frames, preparation, rendering
+from traitbrdf.session.cache import CACHE_BYTES, Cache, cache_key, fixed_key
+from traitbrdf.session.editing import EditSession
+from traitbrdf.session.frames import _size, enlarged
+from traitbrdf.session.preparation import (
+    EXACT_ABOVE,
+    LightTrees,
+    Prepared,
+    _StopError,
+    _Turns,
+    promised,
+    trusted_error,
+)
+from traitbrdf.session.rendering import TRAINED_IMAGES
+from traitbrdf.session.settings import Settings
+from traitbrdf.space.learning import Trait
+from traitbrdf.space.traits import default_traits
+from traitbrdf.transport.basis import Training
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.transport import Transport
 
 TRAITS = default_traits().names
 EMBEDDING = tb.default_embedding()
@@ -38,13 +54,13 @@ LIBRARY = tb.default_library()
 
 @pytest.fixture(autouse=True)
 def small_training(training, monkeypatch):
-    monkeypatch.setattr(editing, "_training", lambda library, seed: training)
+    monkeypatch.setattr(preparation, "training_of", lambda library, seed: training)
 
 
 @pytest.fixture(scope="module")
 def prepared(small_teapot, training):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(editing, "_training", lambda library, seed: training)
+        patch.setattr(preparation, "training_of", lambda library, seed: training)
         return EditSession(small_teapot, quality="preview").prepare()
 
 
@@ -52,7 +68,7 @@ def prepared(small_teapot, training):
 def prepared_ball(training):
     """A ball on the ground, in few pixels, prepared for edits of both."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(editing, "_training", lambda library, seed: training)
+        patch.setattr(preparation, "training_of", lambda library, seed: training)
         session = EditSession(ball_scene(), quality="preview")
         session.move("ground", bright=0.1)
         return session.prepare()
@@ -68,7 +84,7 @@ def over(transport, **arguments):
     session = EditSession(transport.scene, quality="preview", **arguments)
     again = Transport.restored(transport.scene, transport.grid, transport.arrays())
     again._operator = transport._operator  # the rays are cast once
-    session._view.prepared = editing._Prepared(again, False, {}, again)
+    session._view.prepared = Prepared(again, False, {}, again)
     return session
 
 
@@ -399,7 +415,7 @@ def test_the_history_replays_to_the_identical_frame(edit, fresh):
 def test_a_teapot_design_survives_its_file(edit, fresh, tmp_path, shared_data):
     # as few basis images as its error needs, as the loaded one will have
     known = edit._view.prepared
-    edit._view.prepared = editing._promised(known, edit.library, "preview", edit.error, None)
+    edit._view.prepared = promised(known, edit.library, edit.settings)
     edit.assign("body", tb.MeasuredBRDF.read(next((shared_data / "rgl").glob("card*.bsdf"))))
     edit.assign("lid", PerfectMirror(0.7) + 0.2 * Lambert((0.5, 0.1, 0.9)))
     edit.assign("spout", "chrome")
@@ -432,10 +448,10 @@ def test_a_teapot_design_survives_its_file(edit, fresh, tmp_path, shared_data):
 
 def test_the_more_error_the_fewer_images(prepared_ball):
     """Held on materials that neither basis nor choice was fitted to; and no exact frame needed."""
-    known = editing._Prepared(prepared_ball, False, {}, prepared_ball)
+    known = Prepared(prepared_ball, False, {}, prepared_ball)
     images = []
     for error in (0.3, 0.1, 0.03, 0.01):
-        found = editing._promised(known, LIBRARY, "preview", error, None)
+        found = promised(known, LIBRARY, Settings("preview", error))
         promise, transport = found.promise, found.transport
         assert promise.basis_images == transport.rank_used <= promise.of == prepared_ball.rank_used
         assert promise.error_95 <= error or not promise.kept
@@ -472,12 +488,12 @@ def test_truncated_transports_are_the_first_images(prepared_ball):
 
 
 def test_a_promised_speed_is_measured(prepared_ball):
-    known = editing._Prepared(prepared_ball, False, {}, prepared_ball)
-    slow = editing._promised(known, LIBRARY, "preview", None, 1.0).promise
+    known = Prepared(prepared_ball, False, {}, prepared_ball)
+    slow = promised(known, LIBRARY, Settings("preview", fps=1.0)).promise
     assert slow.kept
     assert slow.basis_images == slow.of
     assert slow.seconds < 1.0
-    fast = editing._promised(known, LIBRARY, "preview", None, 1e7).promise
+    fast = promised(known, LIBRARY, Settings("preview", fps=1e7)).promise
     assert not fast.kept
     assert fast.basis_images == min(promises.LADDER)
     assert fast.error_95 > slow.error_95
@@ -747,15 +763,15 @@ def test_frames_are_the_callers(fresh):
 def test_small_parts_bear_more_error(fresh):
     scene = fresh().scene
     counts = np.bincount(scene.pixel_part, minlength=len(scene.parts))
-    allowed = np.array([editing.trusted_error(scene, i) for i in range(len(counts))])
+    allowed = np.array([trusted_error(scene, i) for i in range(len(counts))])
     share = counts / counts[: len(scene.shape.parts)].sum()
-    assert (allowed[share >= 0.1] == promises.TRUSTED * editing.EXACT_ABOVE).all()
-    assert (allowed <= 3.0 * promises.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed[share >= 0.1] == promises.TRUSTED * EXACT_ABOVE).all()
+    assert (allowed <= 3.0 * promises.TRUSTED * EXACT_ABOVE).all()
     small = share < 0.1
     assert small.any()
-    assert (allowed[small] > promises.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (allowed[small] > promises.TRUSTED * EXACT_ABOVE).all()
     # together they add no more to the frame's error than a part of a tenth of the shape may
-    assert (allowed * share)[small].max() <= 0.1 * promises.TRUSTED * editing.EXACT_ABOVE
+    assert (allowed * share)[small].max() <= 0.1 * promises.TRUSTED * EXACT_ABOVE
 
 
 def test_the_report_says_what_was_left_out(prepared_ball):
@@ -901,7 +917,7 @@ def test_a_design_keeps_ground_shadows_and_texture_coordinates(tmp_path, trainin
     same(again.scene.shape.uvs, mesh.uvs)
     same(again.scene.weights, scene.weights)
     # so that what was prepared for it is found again
-    keys = [editing._cache_key(s.scene, LIBRARY, 24, 0.7, 0) for s in (session, again)]
+    keys = [cache_key(s.scene, LIBRARY, 24, 0.7, 0) for s in (session, again)]
     assert keys[0] == keys[1]
 
 
@@ -1113,13 +1129,13 @@ def test_a_frame_that_was_cut_off_is_drawn_again(edit, monkeypatch):
 
 
 def test_kept_frames_are_bounded(edit, monkeypatch):
-    monkeypatch.setattr(editing, "FRAMES_KEPT", 60_000)
+    monkeypatch.setattr(frames, "FRAMES_KEPT", 60_000)
     first = edit.render()
     for i in range(20):
         edit.assign("body", LIBRARY.coordinates[i])
         edit.render()
     view = edit._view
-    assert view.kept_bytes == sum(editing._size(one) for one in view.kept.values()) <= 60_000
+    assert view.kept_bytes == sum(_size(one) for one in view.kept.values()) <= 60_000
     for _ in range(20):
         edit.undo()
     same(edit.render(), first)  # computed anew
@@ -1164,17 +1180,15 @@ def test_a_draft_is_enlarged_to_the_size_of_the_scene(prepared_ball):
             session.draft(odd)
     assert image.flags.c_contiguous
     ramp = np.broadcast_to(np.arange(8, dtype=np.float32)[None, :, None], (4, 8, 3)).copy()
-    larger = editing._enlarged(ramp, 8, 16)
+    larger = enlarged(ramp, 8, 16)
     np.testing.assert_allclose(larger[3, 1:-1, 0], np.arange(0.25, 7.0, 0.5))
 
 
 def test_the_light_is_sorted_once(small_sphere, monkeypatch):
     built = []
-    plain = editing.LightTree.build
-    monkeypatch.setattr(
-        editing.LightTree, "build", lambda light: built.append(light) or plain(light)
-    )
-    trees = editing._LightTrees()
+    plain = LightTree.build
+    monkeypatch.setattr(LightTree, "build", lambda light: built.append(light) or plain(light))
+    trees = LightTrees()
     light = small_sphere.environment
     assert trees.of(light) is trees.of(light.rotated(1.0))
     assert len(built) == 1
@@ -1435,7 +1449,7 @@ print(edit.ready, flush=True)
 
 
 def test_turns_are_taken_by_those_who_are_waited_for_first():
-    turns, order = editing._Turns(), []
+    turns, order = _Turns(), []
     behind, urgent = object(), threading.Event()
     turns.take("first", False, lambda: False)
 
@@ -1463,7 +1477,7 @@ def test_turns_are_taken_by_those_who_are_waited_for_first():
     stopped = threading.Event()
     turns.take("first", True, stopped.is_set)
     threading.Timer(0.05, lambda: (stopped.set(), turns.wake())).start()
-    with pytest.raises(editing._StopError):
+    with pytest.raises(_StopError):
         turns.take("second", False, stopped.is_set)
 
 
@@ -1585,8 +1599,8 @@ def test_a_key_names_all_that_a_preparation_depends_on():
     scene = ball_scene(lights=[light])
 
     def key(scene=scene, library=LIBRARY, rank=24, resolution=0.7, seed=0, fixed=None):
-        whole = editing._cache_key(scene, library, rank, resolution, seed)
-        return editing._fixed_key(whole, fixed or {})
+        whole = cache_key(scene, library, rank, resolution, seed)
+        return fixed_key(whole, fixed or {})
 
     other = tb.Library(EMBEDDING, LIBRARY.names, LIBRARY.coordinates * 0.99, LIBRARY.families)
     pot = tb.Scene(tb.teapot(), scene.environment, size=8)
@@ -1637,7 +1651,7 @@ def test_a_shape_that_only_knows_itself_is_not_cached(cache):
             return self._shape.occluded(origins, directions, max_distance)
 
     scene = tb.Scene(Own(), tb.EnvironmentMap.sky(rows=16), size=8)
-    assert editing._cache_key(scene, LIBRARY, 24, 0.7, 0) is None
+    assert cache_key(scene, LIBRARY, 24, 0.7, 0) is None
     EditSession(scene, "preview").prepare()
     written()
     assert not cache.exists()
@@ -1681,7 +1695,7 @@ def test_a_damaged_file_is_a_miss_and_goes(cache, damage):
 
 def test_the_least_recently_used_go_first(tmp_path):
     arrays = {"numbers": np.zeros(1000)}  # some 8.3 kB in a file
-    cache = editing._Cache(tmp_path / "a" / "b", 30_000)
+    cache = Cache(tmp_path / "a" / "b", 30_000)
     for i, name in enumerate("abc"):
         cache.write(name, arrays)
         os.utime(cache._file(name), (1000 + i, 1000 + i))
@@ -1699,11 +1713,11 @@ def test_the_least_recently_used_go_first(tmp_path):
 
 
 def test_where_the_cache_lies(monkeypatch, tmp_path):
-    usual = editing._Cache.usual
+    usual = Cache.usual
     assert usual() is None  # the tests have it off
     monkeypatch.delenv("TRAITBRDF_CACHE_BYTES")
     monkeypatch.setenv("TRAITBRDF_CACHE", str(tmp_path))
-    assert (usual().folder, usual().limit) == (tmp_path, editing.CACHE_BYTES)
+    assert (usual().folder, usual().limit) == (tmp_path, CACHE_BYTES)
     monkeypatch.delenv("TRAITBRDF_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert usual().folder == tmp_path / "traitbrdf"
@@ -1711,10 +1725,7 @@ def test_where_the_cache_lies(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert usual().folder == tmp_path / "home" / ".cache" / "traitbrdf"
 
-    def homeless():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", homeless)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # a user without a home
     assert usual() is None
     monkeypatch.setenv("TRAITBRDF_CACHE_BYTES", "1e6")
     with pytest.raises(ValueError, match=r"TRAITBRDF_CACHE_BYTES: expected .* got '1e6'"):
@@ -1796,9 +1807,9 @@ def test_edits_to_a_family_that_the_basis_has_not_seen_are_detected(lacking):
         frame = built.shade(0, torch.from_numpy(table[built.cells]))
         true.append(true_error(frame.radiance, truth))
         measured.append(frame.error)
-    beyond = np.asarray(true) > editing.EXACT_ABOVE
+    beyond = np.asarray(true) > EXACT_ABOVE
     assert beyond.sum() >= 5
-    assert (np.asarray(measured)[beyond] > promises.TRUSTED * editing.EXACT_ABOVE).all()
+    assert (np.asarray(measured)[beyond] > promises.TRUSTED * EXACT_ABOVE).all()
 
 
 def test_what_is_shown_of_them_is_right(lacking, monkeypatch):
@@ -1813,7 +1824,7 @@ def test_what_is_shown_of_them_is_right(lacking, monkeypatch):
     assert tiers.count("exact") >= 3
     report = session.report()
     assert report["exact_frames"] == tiers.count("exact")
-    assert 1 <= report["trained_images"]["sphere"] <= editing.TRAINED_IMAGES
+    assert 1 <= report["trained_images"]["sphere"] <= TRAINED_IMAGES
 
 
 def test_edits_near_an_exact_frame_are_shown_by_the_basis(lacking, monkeypatch):
@@ -1839,7 +1850,7 @@ def test_edits_near_an_exact_frame_are_shown_by_the_basis(lacking, monkeypatch):
 
 
 def test_a_basis_takes_only_so_many_images(lacking, monkeypatch):
-    monkeypatch.setattr(editing, "TRAINED_IMAGES", 2)
+    monkeypatch.setattr(rendering, "TRAINED_IMAGES", 2)
     session, known = lacking_session(lacking, monkeypatch, error=0.003)
     trained = []
     plain = Transport.train
@@ -1879,13 +1890,13 @@ def test_by_default_parts_beyond_a_hundredth_are_exact(fresh, monkeypatch):
     edit.assign("handle", wild)
     edit.render()
     report = edit.report()
-    assert report["error_asked"] == editing.EXACT_ABOVE == 0.01
+    assert report["error_asked"] == EXACT_ABOVE == 0.01
     assert report["parts"]["handle"]["tier"] == "exact"
     basis = edit.prepare()
     for i, part in enumerate(edit.scene.parts):
         entry = report["parts"][part]
         if entry["tier"] == "basis":
-            assert entry["error"] <= edit._allowed(edit._view, i)
+            assert entry["error"] <= edit._renderer().allowed(edit._view, i)
     assert basis is edit.prepare()
 
 
@@ -1966,7 +1977,7 @@ def test_a_graphics_card_shows_the_same(prepared_ball):
         known = Transport.restored(
             prepared_ball.scene, EMBEDDING.grid_, prepared_ball.arrays(), device
         )
-        session._view.prepared = editing._Prepared(known, False, {}, known)
+        session._view.prepared = Prepared(known, False, {}, known)
         session.assign("sphere", "gold-satin")
         session.render()
         session.assign("sphere", PerfectMirror(0.3) + Lambert(0.4))
@@ -2014,3 +2025,19 @@ def test_a_trait_of_one_s_own_is_saved_with_the_design(edit, tmp_path):
         tb.EditSession.load(tmp_path / "own.tbr", traits=tb.default_traits()).move(
             "handle", candy=0.1
         )
+
+
+def test_a_frame_that_is_held_is_never_drawn_upon(small_sphere):
+    """Its memory is used again once nobody has it, nor any view of it."""
+    session = EditSession(small_sphere, cache=False)
+    session.assign(small_sphere.parts, "red-rubber")
+    views = [session.render()[::2, ..., 0], memoryview(session.render()), session.render().T]
+    kept = [np.array(view) for view in views]
+    place = session.render().ctypes.data
+    session.assign(small_sphere.parts, "gold-polished")
+    again = session.render()
+    assert again.ctypes.data == place
+    assert again.flags.writeable
+    assert np.abs(again[::2, ..., 0] - kept[0]).max() > 0.01
+    for view, was in zip(views, kept, strict=True):
+        np.testing.assert_array_equal(np.asarray(view), was)

@@ -10,26 +10,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.bench import (
-    RENDERED_UNDER,
-    fresh_recipes,
-    highlight_hole,
-    log_error,
-    measured_sets,
-    spheres_compared,
-)
-from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_operator
-from traitbrdf.embedding import (
-    FLOOR,
-    GRID,
-    BRDFEmbedding,
-    Library,
-    default_embedding,
-    default_library,
-)
-from traitbrdf.lights import EnvironmentMap
-from traitbrdf.measured import MeasuredBRDF
-from traitbrdf.models import GGX, BoundedPhong, Lambert
+from traitbrdf.bench.datasets import fresh_recipes, measured_sets
+from traitbrdf.bench.embedding import RENDERED_UNDER
+from traitbrdf.bench.metrics import highlight_hole, log_error, spheres_compared
+from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_operator
+from traitbrdf.reflectance.measured import MeasuredBRDF
+from traitbrdf.reflectance.models import GGX, BoundedPhong, Lambert
+from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.embedding import GRID, BRDFEmbedding
+from traitbrdf.space.library import Library, default_embedding, default_library
+from traitbrdf.space.logmap import FLOOR
 
 EMBEDDING = default_embedding()
 LIBRARY = default_library()
@@ -576,6 +566,7 @@ def test_one_sample_stays_near_the_mean():
     assert np.abs(np.concatenate(axes(z)[1:])).max() < 1e-9  # grey
 
 
+@pytest.mark.slow
 def test_measured_slices(shared_data):
     """Real materials from the phi_d = 90 degrees slice alone, on the slice."""
     slices, _ = measured_sets(shared_data)

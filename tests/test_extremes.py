@@ -12,20 +12,25 @@ import numpy as np
 import pytest
 import torch
 
-from traitbrdf import lights, reference
-from traitbrdf.brdf import TabulatedBRDF
+from traitbrdf import reference
+from traitbrdf.bench.trade import _sheet
 from traitbrdf.directions import latlong_to_direction, to_local
-from traitbrdf.editing import EditSession
-from traitbrdf.embedding import GRID, default_embedding, default_library
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, LightTree, PointLight
-from traitbrdf.models import GGX, BoundedPhong, Lambert
-from traitbrdf.promises import QUALITIES
-from traitbrdf.quadrature import Operator
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import Mesh, sphere, teapot
-from traitbrdf.trade import _sheet
-from traitbrdf.traits import default_traits
-from traitbrdf.transport import Transport
+from traitbrdf.reflectance.brdf import TabulatedBRDF
+from traitbrdf.reflectance.models import GGX, BoundedPhong, Lambert
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import Mesh, sphere
+from traitbrdf.scene.teapot import teapot
+from traitbrdf.session.budget import QUALITIES
+from traitbrdf.session.editing import EditSession
+from traitbrdf.space.embedding import GRID
+from traitbrdf.space.library import default_embedding, default_library
+from traitbrdf.space.traits import default_traits
+from traitbrdf.transport import lighttree
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.operator import Operator
+from traitbrdf.transport.transport import Transport
 
 FINEST = QUALITIES["reference"][1]
 LIBRARY = default_library()
@@ -161,6 +166,7 @@ def test_a_session_shows_needles(name):
 # -- light ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["GGX 0.01", "GGX 0.1", "GGX 1", "Lambert"])
 def test_a_sun_of_one_texel_beside_a_dark_sky(name):
     """1e6 beside 1e-4: the sun's light is right, and the sky is still there where it is not."""
@@ -215,7 +221,7 @@ def test_blocks_of_texels_shine_as_their_texels(monkeypatch):
     fine = LightTree.build(environment)
     assert fine.block == 1
     plain = finite(Operator(scene, GRID).images(index, tables))
-    monkeypatch.setattr(lights, "_ROWS", 80)
+    monkeypatch.setattr(lighttree, "_ROWS", 80)
     coarse = LightTree.build(environment)
     assert coarse.block == 4
     assert len(coarse.radius) < 0.1 * len(fine.radius)

@@ -10,10 +10,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from data_gen.families import COLOURS, FAMILIES, METALS, Material, materials
-from data_gen.spectra import SPECTRA, reflectance
-from traitbrdf.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
-from traitbrdf.models import GGX, fresnel_conductor
+from traitbrdf.recipes.families import FAMILIES
+from traitbrdf.recipes.looks import COLOURS, METALS, Material
+from traitbrdf.recipes.materials import materials
+from traitbrdf.recipes.spectra import SPECTRA, reflectance
+from traitbrdf.reflectance.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
+from traitbrdf.reflectance.models import GGX, fresnel_conductor
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +190,7 @@ def test_indices_have_the_curve_of_the_spectrum(name):
 
 def test_a_flat_spectrum_is_grey(monkeypatch):
     flat = {"flat": (np.array([700.0, 400.0]), (1.5, 1.5), (2.0, 2.0))}
-    monkeypatch.setattr("data_gen.spectra.SPECTRA", flat)
+    monkeypatch.setattr("traitbrdf.recipes.spectra.SPECTRA", flat)
     rgb = reflectance("flat", np.array([1.0, 0.3]))
     expected = fresnel_conductor(np.array([[1.0], [0.3]]), 1.5, 2.0)
     np.testing.assert_allclose(rgb, np.repeat(expected, 3, axis=1), rtol=1e-9)

@@ -16,8 +16,10 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from traitbrdf import formats
-from traitbrdf.formats import FormatError
+from traitbrdf.formats.brdfs import read_merl, read_rgl, write_merl
+from traitbrdf.formats.display import encode_srgb
+from traitbrdf.formats.files import FormatError, atomic_path, stem
+from traitbrdf.formats.images import read_image, write_exr, write_png
 
 
 def image(height: int = 40, width: int = 17, seed: int = 0) -> np.ndarray:
@@ -53,14 +55,14 @@ def test_format_error_names_path_expected_and_got():
 
 
 def test_stem():
-    assert formats.stem("folder/gold.binary") == "gold"
-    assert formats.stem(Path("x.y.bsdf")) == "x.y"
+    assert stem("folder/gold.binary") == "gold"
+    assert stem(Path("x.y.bsdf")) == "x.y"
 
 
 def test_atomic_path_replaces_the_file(tmp_path):
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")
-    with formats.atomic_path(target) as temporary:
+    with atomic_path(target) as temporary:
         assert temporary.parent == tmp_path
         assert temporary.suffix == ".bin"
         temporary.write_bytes(b"new")
@@ -73,7 +75,7 @@ def test_atomic_path_replaces_the_file(tmp_path):
 def test_atomic_path_keeps_the_old_file_on_failure(tmp_path, error):
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")
-    with pytest.raises(error), formats.atomic_path(target) as temporary:
+    with pytest.raises(error), atomic_path(target) as temporary:
         temporary.write_bytes(b"half")
         raise error("stop")
     assert target.read_bytes() == b"old"
@@ -87,10 +89,10 @@ def test_atomic_path_keeps_the_old_file_if_the_replacement_fails(tmp_path, monke
     def full(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(formats.os, "fsync", full)
+    monkeypatch.setattr("traitbrdf.formats.files.os.fsync", full)
     with (
         pytest.raises(OSError, match="disk full"),
-        formats.atomic_path(target) as temporary,
+        atomic_path(target) as temporary,
     ):
         temporary.write_bytes(b"new")
     assert target.read_bytes() == b"old"
@@ -102,7 +104,7 @@ def test_atomic_path_follows_a_link(tmp_path):
     (tmp_path / "real" / "a.txt").write_text("old")
     link = tmp_path / "link.txt"
     link.symlink_to(tmp_path / "real" / "a.txt")
-    with formats.atomic_path(link) as temporary:
+    with atomic_path(link) as temporary:
         temporary.write_text("new")
     assert link.is_symlink()
     assert (tmp_path / "real" / "a.txt").read_text() == "new"
@@ -111,12 +113,12 @@ def test_atomic_path_follows_a_link(tmp_path):
 def test_atomic_path_refuses_wrong_places(tmp_path):
     with (
         pytest.raises(FileNotFoundError, match="missing"),
-        formats.atomic_path(tmp_path / "missing" / "a.exr"),
+        atomic_path(tmp_path / "missing" / "a.exr"),
     ):
         pass
-    with pytest.raises(IsADirectoryError), formats.atomic_path(tmp_path):
+    with pytest.raises(IsADirectoryError), atomic_path(tmp_path):
         pass
-    with pytest.raises(FileNotFoundError, match="nothing"), formats.atomic_path(tmp_path / "a"):
+    with pytest.raises(FileNotFoundError, match="nothing"), atomic_path(tmp_path / "a"):
         pass
     assert left_behind(tmp_path) == []
 
@@ -124,9 +126,9 @@ def test_atomic_path_refuses_wrong_places(tmp_path):
 @pytest.mark.parametrize(
     ("name", "write"),
     [
-        ("a.exr", lambda path: formats.write_exr(path, image())),
-        ("a.png", lambda path: formats.write_png(path, np.zeros((4, 5, 3), np.uint8))),
-        ("a.binary", lambda path: formats.write_merl(path, np.ones((2, 3, 4, 3)))),
+        ("a.exr", lambda path: write_exr(path, image())),
+        ("a.png", lambda path: write_png(path, np.zeros((4, 5, 3), np.uint8))),
+        ("a.binary", lambda path: write_merl(path, np.ones((2, 3, 4, 3)))),
     ],
 )
 def test_a_writer_that_fails_half_way_leaves_the_old_file(tmp_path, monkeypatch, name, write):
@@ -148,7 +150,7 @@ def test_a_writer_that_fails_half_way_leaves_the_old_file(tmp_path, monkeypatch,
     assert left_behind(tmp_path) == [name]
 
 
-@pytest.mark.parametrize("read", [formats.read_image, formats.read_merl, formats.read_rgl])
+@pytest.mark.parametrize("read", [read_image, read_merl, read_rgl])
 def test_missing_and_foreign_files(tmp_path, read):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read(tmp_path / "nowhere.exr")
@@ -166,29 +168,29 @@ def test_missing_and_foreign_files(tmp_path, read):
 def test_exr_float_round_trip_is_exact(tmp_path):
     pixels = image()
     pixels[0, 0] = -1.5, np.inf, np.nan
-    formats.write_exr(tmp_path / "a.exr", pixels)
-    back = formats.read_image(tmp_path / "a.exr")
+    write_exr(tmp_path / "a.exr", pixels)
+    back = read_image(tmp_path / "a.exr")
     assert back.dtype == np.float32
     np.testing.assert_array_equal(back, pixels)
 
 
 def test_exr_half_round_trip_within_its_rounding(tmp_path):
     pixels = np.clip(image(), 1e-3, 6e4)
-    formats.write_exr(str(tmp_path / "a.exr"), pixels, half=True)
-    np.testing.assert_allclose(formats.read_image(tmp_path / "a.exr"), pixels, rtol=2**-11)
+    write_exr(str(tmp_path / "a.exr"), pixels, half=True)
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr"), pixels, rtol=2**-11)
 
 
 def test_exr_content_decides_not_the_extension(tmp_path):
-    formats.write_exr(tmp_path / "a.exr", image())
+    write_exr(tmp_path / "a.exr", image())
     (tmp_path / "a.exr").rename(tmp_path / "a.hdr")
-    np.testing.assert_array_equal(formats.read_image(tmp_path / "a.hdr"), image())
+    np.testing.assert_array_equal(read_image(tmp_path / "a.hdr"), image())
 
 
 @pytest.mark.parametrize(("half", "value"), [(True, 7e4), (True, -65520.0), (False, 1e39)])
 def test_exr_refuses_what_the_precision_cannot_hold(tmp_path, half, value):
     pixels = np.full((2, 2, 3), value)
     with pytest.raises(ValueError, match="expected values below"):
-        formats.write_exr(tmp_path / "a.exr", pixels, half=half)
+        write_exr(tmp_path / "a.exr", pixels, half=half)
     assert left_behind(tmp_path) == []
 
 
@@ -197,7 +199,7 @@ def test_exr_refuses_what_the_precision_cannot_hold(tmp_path, half, value):
 )
 def test_exr_refuses_other_shapes_and_types(tmp_path, wrong):
     with pytest.raises(ValueError, match="expected"):
-        formats.write_exr(tmp_path / "a.exr", wrong)
+        write_exr(tmp_path / "a.exr", wrong)
 
 
 def write_channels(path: Path, channels: dict[str, Any], **header: Any) -> None:
@@ -210,11 +212,11 @@ def test_exr_alpha_is_dropped_and_grey_repeated(tmp_path):
     pixels = image()
     rgba = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
     write_channels(tmp_path / "rgba.exr", {"RGBA": rgba})
-    np.testing.assert_array_equal(formats.read_image(tmp_path / "rgba.exr"), pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "rgba.exr"), pixels)
     grey = np.ascontiguousarray(pixels[..., 0])
     write_channels(tmp_path / "grey.exr", {"Y": grey, "A": grey})
     np.testing.assert_array_equal(
-        formats.read_image(tmp_path / "grey.exr"), np.repeat(grey[..., None], 3, axis=-1)
+        read_image(tmp_path / "grey.exr"), np.repeat(grey[..., None], 3, axis=-1)
     )
 
 
@@ -223,10 +225,10 @@ def test_exr_without_colour_is_refused(tmp_path):
     for names, shown in ((["Z"], "Z"), (["R", "G"], "G, R"), (["Y", "RY", "BY"], "BY, RY, Y")):
         write_channels(tmp_path / "a.exr", dict.fromkeys(names, plane))
         with pytest.raises(FormatError, match=f"got channels {shown}$"):
-            formats.read_image(tmp_path / "a.exr")
+            read_image(tmp_path / "a.exr")
     write_channels(tmp_path / "a.exr", {"RGB": np.ones((4, 4, 3), np.uint32)})
     with pytest.raises(FormatError, match="uint32"):
-        formats.read_image(tmp_path / "a.exr")
+        read_image(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize(
@@ -237,56 +239,56 @@ def test_exr_compressions(tmp_path, compression):
     pixels = np.clip(image(70, 33), 0.01, 100.0).astype(np.float16)
     kind = getattr(OpenEXR, f"{compression}_COMPRESSION")
     write_channels(tmp_path / "a.exr", {"RGB": pixels}, compression=kind)
-    assert formats.read_image(tmp_path / "a.exr").shape == (70, 33, 3)
+    assert read_image(tmp_path / "a.exr").shape == (70, 33, 3)
     data = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "a.exr").write_bytes(data[:-1])
     with pytest.raises(FormatError, match="cut within pixels"):
-        formats.read_image(tmp_path / "a.exr")
+        read_image(tmp_path / "a.exr")
 
 
 def test_exr_truncated_anywhere_is_refused_silently(tmp_path, capfd):
-    formats.write_exr(tmp_path / "whole.exr", image())
+    write_exr(tmp_path / "whole.exr", image())
     data = (tmp_path / "whole.exr").read_bytes()
     for count in (1, 4, 6, 9, 30, 100, 300, 340, 400, len(data) // 2, len(data) - 1):
         (tmp_path / "cut.exr").write_bytes(data[:count])
         with pytest.raises(FormatError, match=r"cut\.exr: expected"):
-            formats.read_image(tmp_path / "cut.exr")
+            read_image(tmp_path / "cut.exr")
     assert capfd.readouterr() == ("", "")
 
 
 def test_exr_damaged_pixels_are_refused(tmp_path, capsys):
     smooth = np.linspace(0, 1, 40 * 17 * 3).reshape(40, 17, 3)  # noise would stand uncompressed
-    formats.write_exr(tmp_path / "a.exr", smooth)
+    write_exr(tmp_path / "a.exr", smooth)
     data = bytearray((tmp_path / "a.exr").read_bytes())
     (offset,) = struct.unpack_from("<Q", data, data.index(b"scanlineimage\0") + 14)
     assert struct.unpack_from("<i", data, offset) == (0,)  # the first chunk: row, size, pixels
     data[offset + 8 : offset + 60] = b"\xff" * 52
     (tmp_path / "a.exr").write_bytes(data)
     with pytest.raises(FormatError, match="expected a readable OpenEXR image"):
-        formats.read_image(tmp_path / "a.exr")
+        read_image(tmp_path / "a.exr")
     assert capsys.readouterr().out == ""
 
 
 def test_exr_absurd_headers_are_refused_without_allocating(tmp_path):
-    formats.write_exr(tmp_path / "a.exr", image())
+    write_exr(tmp_path / "a.exr", image())
     data = (tmp_path / "a.exr").read_bytes()
     window = data.index(b"dataWindow\0box2i\0") + 17 + 4
     for corners in ((0, 0, 2**31 - 2, 2**31 - 2), (0, 0, -5, 10), (0, 0, 16, 10**6)):
         changed = data[:window] + struct.pack("<4i", *corners) + data[window + 16 :]
         (tmp_path / "b.exr").write_bytes(changed)
-        assert_refused_cheaply(formats.read_image, tmp_path / "b.exr")
+        assert_refused_cheaply(read_image, tmp_path / "b.exr")
     for position, value in ((4, 3), (5, 8), (window - 4, 255)):  # version, deep data, length
         changed = bytearray(data)
         changed[position] = value
         (tmp_path / "b.exr").write_bytes(changed)
-        assert_refused_cheaply(formats.read_image, tmp_path / "b.exr")
+        assert_refused_cheaply(read_image, tmp_path / "b.exr")
     nameless = data.replace(b"dataWindow", b"dataWindoW")
     (tmp_path / "b.exr").write_bytes(nameless)
     with pytest.raises(FormatError, match="dataWindow"):
-        formats.read_image(tmp_path / "b.exr")
+        read_image(tmp_path / "b.exr")
     (tmp_path / "b.exr").write_bytes(data[:8] + b"x" * 600)
     with pytest.raises(FormatError, match="without an end"):
-        formats.read_image(tmp_path / "b.exr")
+        read_image(tmp_path / "b.exr")
 
 
 def assert_refused_cheaply(read: Callable[[Path], object], path: Path) -> None:
@@ -303,7 +305,7 @@ def test_real_maps_read(shared_data):
     paths = sorted((shared_data / "envmaps").glob("*.exr"))
     assert len(paths) >= 8
     for path in paths:
-        pixels = formats.read_image(path)
+        pixels = read_image(path)
         assert pixels.shape == (256, 512, 3)
         assert pixels.dtype == np.float32
         assert np.isfinite(pixels).all()
@@ -365,7 +367,7 @@ def test_radiance_scanlines(tmp_path, style):
     else:
         body = new_style(pixels) if style == "new" else pixels.tobytes()
     (tmp_path / "a.hdr").write_bytes(radiance(body, "-Y 7 +X 300"))
-    result = formats.read_image(tmp_path / "a.hdr")
+    result = read_image(tmp_path / "a.hdr")
     assert result.dtype == np.float32
     np.testing.assert_array_equal(result, decoded(pixels).astype(np.float32))
 
@@ -380,7 +382,7 @@ def test_radiance_orientation_and_exposure(tmp_path):
         ("-Y 5 -X 6", expected[:, ::-1]),
     ):
         (tmp_path / "a.pic").write_bytes(radiance(pixels.tobytes(), size, header))
-        np.testing.assert_allclose(formats.read_image(tmp_path / "a.pic"), view / 4, rtol=1e-7)
+        np.testing.assert_allclose(read_image(tmp_path / "a.pic"), view / 4, rtol=1e-7)
 
 
 @pytest.mark.parametrize("style", ["flat", "new"])
@@ -399,7 +401,7 @@ def test_radiance_truncated_anywhere(tmp_path, style):
     ):
         (tmp_path / "cut.hdr").write_bytes(data[:count])
         with pytest.raises(FormatError, match=r"cut\.hdr: expected"):
-            formats.read_image(tmp_path / "cut.hdr")
+            read_image(tmp_path / "cut.hdr")
 
 
 @pytest.mark.parametrize(
@@ -421,8 +423,8 @@ def test_radiance_truncated_anywhere(tmp_path, style):
 def test_radiance_wrong_headers_and_runs(tmp_path, data, message):
     (tmp_path / "a.hdr").write_bytes(data)
     with pytest.raises(FormatError, match=message):
-        formats.read_image(tmp_path / "a.hdr")
-    assert_refused_cheaply(formats.read_image, tmp_path / "a.hdr")
+        read_image(tmp_path / "a.hdr")
+    assert_refused_cheaply(read_image, tmp_path / "a.hdr")
 
 
 # -- PNG and sRGB -----------------------------------------------------------------------------
@@ -430,7 +432,7 @@ def test_radiance_wrong_headers_and_runs(tmp_path, data, message):
 
 def test_png_round_trip(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (9, 13, 3)).astype(np.uint8)
-    formats.write_png(tmp_path / "a.png", pixels)
+    write_png(tmp_path / "a.png", pixels)
     with Image.open(tmp_path / "a.png") as back:
         assert back.format == "PNG"
         np.testing.assert_array_equal(np.asarray(back), pixels)
@@ -439,7 +441,7 @@ def test_png_round_trip(tmp_path):
 def test_png_refuses_other_types_and_shapes(tmp_path):
     for wrong in (np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8)):
         with pytest.raises(ValueError, match="expected"):
-            formats.write_png(tmp_path / "a.png", wrong)
+            write_png(tmp_path / "a.png", wrong)
     assert left_behind(tmp_path) == []
 
 
@@ -447,22 +449,22 @@ def test_srgb_is_exact_and_clips():
     codes = np.arange(256) / 255.0  # decoded by the inverse of the standard's formula
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     for dtype in (np.float32, np.float64):
-        encoded = formats.encode_srgb(np.repeat(linear[:, None], 3, axis=1).astype(dtype))
+        encoded = encode_srgb(np.repeat(linear[:, None], 3, axis=1).astype(dtype))
         assert encoded.dtype == np.uint8
         np.testing.assert_array_equal(encoded[:, 0], np.arange(256))
     np.testing.assert_array_equal(
-        formats.encode_srgb([[-1.0, 2.0, np.inf], [-np.inf, 0.0, 0.18]]),
+        encode_srgb([[-1.0, 2.0, np.inf], [-np.inf, 0.0, 0.18]]),
         [[0, 255, 255], [0, 0, 118]],
     )
 
 
 def test_srgb_refuses_nan_and_other_shapes():
     with pytest.raises(ValueError, match="got 1 NaN"):
-        formats.encode_srgb([0.0, np.nan, 1.0])
+        encode_srgb([0.0, np.nan, 1.0])
     with pytest.raises(ValueError, match="shape"):
-        formats.encode_srgb(np.zeros((3, 4)))
+        encode_srgb(np.zeros((3, 4)))
     with pytest.raises(ValueError, match="real numbers"):
-        formats.encode_srgb(["a", "b", "c"])
+        encode_srgb(["a", "b", "c"])
 
 
 # -- MERL -------------------------------------------------------------------------------------
@@ -472,8 +474,8 @@ def test_merl_round_trip_and_layout(tmp_path):
     values = np.random.default_rng(0).random((4, 3, 5, 3)) * 100.0
     values[1, 2, 3] = -1.0  # invalid cells stay what they are
     path = tmp_path / "a.binary"
-    formats.write_merl(path, values)
-    np.testing.assert_allclose(formats.read_merl(path), values, rtol=4e-16)
+    write_merl(path, values)
+    np.testing.assert_allclose(read_merl(path), values, rtol=4e-16)
     data = path.read_bytes()
     assert len(data) == 12 + 24 * 60
     assert struct.unpack("<3i", data[:12]) == (4, 3, 5)
@@ -486,9 +488,9 @@ def test_merl_round_trip_and_layout(tmp_path):
 
 def test_merl_full_size(tmp_path):
     values = np.random.default_rng(0).random((90, 90, 180, 3))
-    formats.write_merl(tmp_path / "a.binary", values.astype(np.float32))
+    write_merl(tmp_path / "a.binary", values.astype(np.float32))
     assert (tmp_path / "a.binary").stat().st_size == 34_992_012
-    back = formats.read_merl(tmp_path / "a.binary")
+    back = read_merl(tmp_path / "a.binary")
     np.testing.assert_allclose(back, values.astype(np.float32), rtol=4e-16)
 
 
@@ -497,30 +499,30 @@ def test_merl_full_size(tmp_path):
 )
 def test_merl_headers_that_lie(tmp_path, dims):
     path = tmp_path / "a.binary"
-    formats.write_merl(path, np.ones((2, 3, 4, 3)))
+    write_merl(path, np.ones((2, 3, 4, 3)))
     path.write_bytes(struct.pack("<3i", *dims) + path.read_bytes()[12:])
     with pytest.raises(FormatError, match=r"expected a MERL file.+got 588 bytes"):
-        formats.read_merl(path)
-    assert_refused_cheaply(formats.read_merl, path)
+        read_merl(path)
+    assert_refused_cheaply(read_merl, path)
 
 
 def test_merl_truncated_or_too_long(tmp_path):
     path = tmp_path / "a.binary"
-    formats.write_merl(path, np.ones((2, 3, 4, 3)))
+    write_merl(path, np.ones((2, 3, 4, 3)))
     data = path.read_bytes()
     for changed in (data[:5], data[:12], data[:200], data[:-1], data + b"\0"):
         path.write_bytes(changed)
         with pytest.raises(FormatError, match=r"a.binary: expected"):
-            formats.read_merl(path)
+            read_merl(path)
     path.write_bytes(data[:-8] + struct.pack("<d", math.nan))
     with pytest.raises(FormatError, match="23 in colour 2"):
-        formats.read_merl(path)
+        read_merl(path)
 
 
 def test_merl_refuses_to_write_other_values(tmp_path):
     for wrong in (np.ones((2, 3, 4)), np.ones((0, 3, 4, 3)), np.full((2, 2, 2, 3), np.nan)):
         with pytest.raises(ValueError, match="expected"):
-            formats.write_merl(tmp_path / "a.binary", wrong)
+            write_merl(tmp_path / "a.binary", wrong)
     assert left_behind(tmp_path) == []
 
 
@@ -529,7 +531,7 @@ def test_merl_refuses_to_write_other_values(tmp_path):
 
 def test_rgl_reads_what_was_written(tmp_path, tensor_writer, rgl_fields):
     rgl_fields["jacobian"] = np.ones(1, np.uint8)
-    fields = formats.read_rgl(tensor_writer(tmp_path / "a.bsdf", rgl_fields))
+    fields = read_rgl(tensor_writer(tmp_path / "a.bsdf", rgl_fields))
     for name in ("phi_i", "theta_i", "sigma", "ndf", "vndf", "luminance", "rgb"):
         np.testing.assert_array_equal(getattr(fields, name), rgl_fields[name])
     assert fields.jacobian is True
@@ -542,7 +544,7 @@ def test_rgl_truncated_anywhere(tmp_path, tensor_writer, rgl_fields):
     for count in (5, 12, 14, 18, 19, 25, 60, 200, 400, 1000, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:count])
         with pytest.raises(FormatError, match=r"a.bsdf: expected"):
-            formats.read_rgl(path)
+            read_rgl(path)
 
 
 def test_rgl_wrong_magic_and_version(tmp_path, tensor_writer, rgl_fields):
@@ -553,7 +555,7 @@ def test_rgl_wrong_magic_and_version(tmp_path, tensor_writer, rgl_fields):
         changed[position] = 9
         path.write_bytes(changed)
         with pytest.raises(FormatError, match=message):
-            formats.read_rgl(path)
+            read_rgl(path)
 
 
 def test_rgl_absurd_tables_are_refused_without_allocating(tmp_path, tensor_writer, rgl_fields):
@@ -570,7 +572,7 @@ def test_rgl_absurd_tables_are_refused_without_allocating(tmp_path, tensor_write
         (14, struct.pack("<I", 2**32 - 1)),
     ):
         path.write_bytes(data[:position] + value + data[position + len(value) :])
-        assert_refused_cheaply(formats.read_rgl, path)
+        assert_refused_cheaply(read_rgl, path)
 
 
 @pytest.mark.parametrize(
@@ -598,14 +600,14 @@ def test_rgl_fields_that_do_not_fit(tmp_path, tensor_writer, rgl_fields, name, v
     else:
         rgl_fields[name] = value
     with pytest.raises(FormatError, match=message):
-        formats.read_rgl(tensor_writer(tmp_path / "a.bsdf", rgl_fields))
+        read_rgl(tensor_writer(tmp_path / "a.bsdf", rgl_fields))
 
 
 def test_rgl_real_files(shared_data):
     paths = sorted((shared_data / "rgl").glob("*.bsdf"))
     assert len(paths) >= 8
     for path in paths:
-        fields = formats.read_rgl(path)
+        fields = read_rgl(path)
         assert fields.phi_i.shape == (1,)
         assert fields.rgb.shape == (1, 8, 3, 32, 32)
         assert fields.jacobian
@@ -617,17 +619,17 @@ def test_rgl_real_files(shared_data):
 def test_damaged_bytes_end_in_format_error(tmp_path, tensor_writer, rgl_fields, kind):
     """Random damage to headers and bodies either still reads or is refused by name."""
     path = tmp_path / f"a.{kind}"
-    read: Callable[[Path], object] = formats.read_image
+    read: Callable[[Path], object] = read_image
     if kind == "exr":
-        formats.write_exr(path, image(12, 9))
+        write_exr(path, image(12, 9))
     elif kind == "hdr":
         path.write_bytes(radiance(new_style(rgbe(4, 40)), "-Y 4 +X 40"))
     elif kind == "binary":
-        formats.write_merl(path, np.ones((2, 3, 4, 3)))
-        read = formats.read_merl
+        write_merl(path, np.ones((2, 3, 4, 3)))
+        read = read_merl
     else:
         tensor_writer(path, rgl_fields)
-        read = formats.read_rgl
+        read = read_rgl
     data = path.read_bytes()
     rng = np.random.default_rng(3)
     refused = 0

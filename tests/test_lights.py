@@ -9,16 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf import formats
 from traitbrdf.directions import direction_to_latlong, latlong_to_direction
-from traitbrdf.lights import (
+from traitbrdf.formats.files import FormatError
+from traitbrdf.formats.images import read_image, write_exr
+from traitbrdf.scene.lights import (
     DirectionalLight,
     EnvironmentMap,
-    LightTree,
     PointLight,
     texel_moments,
     turn_about_y,
 )
+from traitbrdf.transport.lighttree import LightTree
 
 SIZES = [(1, 1), (1, 7), (9, 1), (2, 2), (3, 5), (16, 32), (33, 66), (256, 512)]
 MAPS = (
@@ -428,14 +429,14 @@ def test_real_maps_read(shared_data, name):
     environment = EnvironmentMap.read(path)
     assert environment.image.shape == (256, 512, 3)
     assert environment.image.min() == 0.0
-    stored = formats.read_image(path)
+    stored = read_image(path)
     assert environment.clipped_texels == np.count_nonzero((stored < 0.0).any(-1)) > 0
     np.testing.assert_array_equal(environment.image, np.maximum(stored, 0.0))
 
 
 def test_written_maps_read_back(tmp_path):
     image = random_map((6, 12)).image
-    formats.write_exr(tmp_path / "a.exr", image)
+    write_exr(tmp_path / "a.exr", image)
     environment = EnvironmentMap.read(tmp_path / "a.exr")
     np.testing.assert_array_equal(environment.image, image)
     assert environment.clipped_texels == 0
@@ -446,7 +447,7 @@ def test_undershoot_is_clipped_and_counted(tmp_path):
     image[8, 0] = 40.0
     image[8, 31] = -9.0  # next to it across the seam, less than a quarter of it
     image[7, 1, 2] = -0.1
-    formats.write_exr(tmp_path / "a.exr", image)
+    write_exr(tmp_path / "a.exr", image)
     environment = EnvironmentMap.read(tmp_path / "a.exr")
     assert environment.clipped_texels == 2
     np.testing.assert_array_equal(environment.image, np.maximum(image, 0.0))
@@ -458,9 +459,9 @@ def test_maps_that_are_no_light_are_refused(tmp_path, value, layout):
     image = np.ones((16, 16, 3), np.float32)
     image[8, 5, 1] = value
     path = tmp_path / "outlier.exr"
-    formats.write_exr(path, image)
+    write_exr(path, image)
     expected = "1 values down to -3" if value == -3.0 else "1 values that are not"
-    with pytest.raises(formats.FormatError, match=r"outlier\.exr") as caught:
+    with pytest.raises(FormatError, match=r"outlier\.exr") as caught:
         EnvironmentMap.read(path, layout=layout)
     assert expected in str(caught.value)
 
@@ -497,7 +498,7 @@ def probe(layout, size=256):
 def test_probes_are_unwrapped(tmp_path, layout):
     directions = probe(layout)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-12)
-    formats.write_exr(tmp_path / "probe.exr", smooth(directions))
+    write_exr(tmp_path / "probe.exr", smooth(directions))
     environment = EnvironmentMap.read(tmp_path / "probe.exr", layout=layout)
     assert environment.image.shape == (128, 256, 3)
     error = np.abs(environment.image / smooth(texel_centres(128, 256)) - 1.0)

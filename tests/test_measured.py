@@ -8,10 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from traitbrdf import formats
-from traitbrdf.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_of
 from traitbrdf.directions import from_half_diff_angles
-from traitbrdf.measured import MeasuredBRDF, _Warp
+from traitbrdf.formats.brdfs import read_rgl
+from traitbrdf.formats.files import FormatError
+from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, HalfDiffGrid, TabulatedBRDF, albedo_of
+from traitbrdf.reflectance.measured import MeasuredBRDF, _Warp
 
 MATERIALS = (
     "acrylic_felt_purple",
@@ -119,10 +120,10 @@ def test_anisotropic_and_wrong_files_are_refused(tmp_path, tensor_writer, rgl_fi
     for name in ("vndf", "luminance", "rgb"):
         rgl_fields[name] = np.repeat(rgl_fields[name], 3, axis=0)
     path = tensor_writer(tmp_path / "a.bsdf", rgl_fields)
-    with pytest.raises(formats.FormatError, match=r"a.bsdf: expected an isotropic .+ 3 azimuths"):
+    with pytest.raises(FormatError, match=r"a.bsdf: expected an isotropic .+ 3 azimuths"):
         MeasuredBRDF.read(path)
     with pytest.raises(ValueError, match="isotropic"):
-        MeasuredBRDF(formats.read_rgl(path))
+        MeasuredBRDF(read_rgl(path))
     with pytest.raises(FileNotFoundError):
         MeasuredBRDF.read(tmp_path / "missing.bsdf")
 

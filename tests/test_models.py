@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
-from traitbrdf.models import (
+from traitbrdf.reflectance.brdf import albedo_of, from_half_diff_angles, hemisphere_nodes
+from traitbrdf.reflectance.models import (
     ABC,
     GGX,
     GTR,

@@ -25,13 +25,18 @@ import os
 import numpy as np
 import pytest
 
-from traitbrdf import bench, peers, reference
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
-from traitbrdf.models import GGX, Lambert
-from traitbrdf.peers import fit_lobe, integrator, their_map, their_rays, their_scene, traced
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import Mesh, sphere, teapot
+from traitbrdf import reference
+from traitbrdf.bench import peers
+from traitbrdf.bench.peers import fit_lobe, integrator, their_map, their_rays, their_scene, traced
+from traitbrdf.bench.rivals import PEER_MATERIALS
+from traitbrdf.bench.run import run
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.models import GGX, Lambert
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import Mesh, sphere
+from traitbrdf.scene.teapot import teapot
 
 pytestmark = pytest.mark.slow
 
@@ -274,13 +279,13 @@ def test_borders_are_theirs(peer, name):
 
 
 def test_bench_beside_mitsuba(peer, shared_data):
-    records = {r.name: r for r in bench.run(["peers"], shared_data, True, lambda line: None)}
+    records = {r.name: r for r in run(["peers"], shared_data, True, lambda line: None)}
     agreement = records["Mitsuba, converged, against our reference"]
     assert agreement.value < 1.0
     ratios = [r for name, r in records.items() if name.startswith("faster than Mitsuba")]
-    assert len(ratios) == len(bench.PEER_MATERIALS) + 1
+    assert len(ratios) == len(PEER_MATERIALS) + 1
     assert min(r.value for r in ratios) > 1.0
-    for name in bench.PEER_MATERIALS:
+    for name in PEER_MATERIALS:
         ours, theirs = (
             records[f"{who}, {name}, {what}"]
             for who, what in (("ours", "edit to frame"), ("Mitsuba", "frame at 2 %"))

@@ -10,11 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.bench import highlight_hole
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
-from traitbrdf.embedding import FLOOR, default_embedding
-from traitbrdf.models import GGX, Coated, Lambert, OrenNayar, Sheen
-from traitbrdf.profiles import HIGHLIGHT, Profiles
+from traitbrdf.bench.metrics import highlight_hole
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.models import GGX, Coated, Lambert, OrenNayar, Sheen
+from traitbrdf.space.highlights import HIGHLIGHT, Profiles
+from traitbrdf.space.library import default_embedding
+from traitbrdf.space.logmap import FLOOR
 
 GRID = HalfDiffGrid(24, 8, 4)
 MEMBERS = [

@@ -8,15 +8,20 @@ import math
 import numpy as np
 import pytest
 
-from traitbrdf import quadrature, reference
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf import reference
 from traitbrdf.directions import reflect
-from traitbrdf.embedding import GRID, default_library
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, LightTree, PointLight, texel_moments
-from traitbrdf.models import GGX, Lambert
-from traitbrdf.quadrature import Operator, VisibilityCut
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import sphere, teapot
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.models import GGX, Lambert
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight, texel_moments
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import sphere
+from traitbrdf.scene.teapot import teapot
+from traitbrdf.space.embedding import GRID
+from traitbrdf.space.library import default_library
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.operator import _FLAT, Operator, _core, _lobe
+from traitbrdf.transport.visibility import VisibilityCut
 
 LIBRARY = default_library()
 NAMES = ("chrome", "blue-plastic", "green-felt", "red-rubber", "gold-satin", "white-plaster")
@@ -112,6 +117,7 @@ def teapot_on_ground(size=48):
 # -- against the oracle -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rows_without_shadows(small_teapot):
     """Sharp and rough tables under a map and two lights beside it."""
     scene = small_teapot.changed(shadows=False)
@@ -331,7 +337,7 @@ def test_samples_at_borders_have_shadows_of_their_own():
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_how_fragments_are_grouped_does_not_show(make):
     scene = make()
-    core = quadrature._core(GRID, channels(TABLES))
+    core = _core(GRID, channels(TABLES))
     operator = Operator(scene, GRID, core=core)
     index = some(scene, 40)
     shuffled = np.random.default_rng(2).permutation(len(index))
@@ -380,7 +386,7 @@ def test_images_of_whole_parts(shadows):
 def test_rows_as_shown_are_those_of_the_images(make):
     """With the same shadows and walks, whatever is asked for beside: a basis is fitted to them."""
     scene = make()
-    operator = Operator(scene, GRID, core=quadrature._core(GRID, channels(TABLES)))
+    operator = Operator(scene, GRID, core=_core(GRID, channels(TABLES)))
     index = some(scene, 60)
     rows = operator.rows_as_shown(index)
     found = np.einsum("mck,kt->mct", rows, channels(TABLES), optimize=True)
@@ -663,19 +669,19 @@ def test_lobes_as_wide_as_their_tables_are(small_sphere):
     angles = GRID.theta_h[:, None, None, None]
     for width in (0.05, 0.2):
         inside = 2.0 - np.clip(angles - width, 0.0, 1.0) + np.zeros((*GRID.shape, 1))
-        found = quadrature._lobe(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
+        found = _lobe(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
         # within it they change by no more than is allowed
-        assert width <= found <= width + 1.2 * quadrature._FLAT * 2.0
-    assert quadrature._lobe(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
+        assert width <= found <= width + 1.2 * _FLAT * 2.0
+    assert _lobe(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
     noise = np.random.default_rng(0).random((GRID.size, 2), dtype=np.float32)
-    assert quadrature._lobe(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
+    assert _lobe(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
 
 
 def test_what_views_never_see_does_not_narrow_lobes():
     table = np.ones((*GRID.shape, 1), np.float32)
     table[:3, GRID.theta_d > 1.4] = 100.0
-    assert quadrature._lobe(GRID, table.reshape(-1, 1), 1.5) < 0.01
-    assert quadrature._lobe(GRID, table.reshape(-1, 1), 0.9) > 1.5
+    assert _lobe(GRID, table.reshape(-1, 1), 1.5) < 0.01
+    assert _lobe(GRID, table.reshape(-1, 1), 0.9) > 1.5
 
 
 def test_wide_lobes_have_far_images_alone():

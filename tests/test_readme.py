@@ -1,4 +1,4 @@
-"""The README's code runs, and its figures are the ones the benchmark wrote."""
+"""The README's and the guide's code runs, and what they name is there."""
 
 from __future__ import annotations
 
@@ -11,29 +11,35 @@ import pytest
 
 from traitbrdf.cli import main
 
-README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(
+        rf"```{language}\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL
+    )
 
 
 @pytest.mark.slow
-def test_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", ["README.md", "docs/guide.md"])
+def test_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for block in blocks("python"):
+    for block in blocks(page, "python"):
         exec(block, names)
-    image = names["image"]
-    assert isinstance(image, np.ndarray)
-    assert image.shape == (128, 128, 3)
-    assert (tmp_path / "design.tbr").exists()
-    assert (tmp_path / "handle.binary").stat().st_size == 34_992_012
+    if page == "README.md":
+        image = names["image"]
+        assert isinstance(image, np.ndarray)
+        assert image.shape == (128, 128, 3)
+        assert (tmp_path / "design.tbr").exists()
+        assert (tmp_path / "handle.binary").stat().st_size == 34_992_012
 
 
 COMMANDS = [
     line.split("#")[0].strip()
-    for block in blocks("sh")
+    for page in ("README.md", "docs/guide.md")
+    for block in blocks(page, "sh")
     for line in block.splitlines()
     if line.startswith("traitbrdf ")
 ]
@@ -56,8 +62,19 @@ def test_command_runs(
     assert capsys.readouterr().out
 
 
-def test_files_named_exist() -> None:
-    root = Path(__file__).resolve().parents[1]
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_pages_link_to_exists(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
-            assert (root / target).exists(), target
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_source_files_that_pages_name_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for file in re.findall(r"`((?:traitbrdf|data_gen|tests)/[\w/]+\.(?:py|js))`", text):
+        assert (ROOT / file).exists(), file
+
+
+def test_the_readme_is_read_in_two_minutes() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120

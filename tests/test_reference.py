@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from traitbrdf import reference
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF, albedo_of, hemisphere_nodes
 from traitbrdf.directions import from_half_diff_angles, reflect, to_local
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight, turn_about_y
-from traitbrdf.models import (
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF, albedo_of, hemisphere_nodes
+from traitbrdf.reflectance.models import (
     GGX,
     AshikhminShirley,
     BoundedPhong,
@@ -28,8 +27,10 @@ from traitbrdf.models import (
     Sheen,
     TorranceSparrowSimplified,
 )
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import Mesh, sphere
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight, turn_about_y
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import Mesh, sphere
 
 # resolves the sharpest lobe here, width 0.002, where the nodes of a table do not
 FINE = np.unique(np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 60), np.linspace(0.05, 1.57, 60)]))

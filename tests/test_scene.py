@@ -13,10 +13,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import traitbrdf.scene as scene_module
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, PointLight
-from traitbrdf.scene import GROUND, MAX_SIDE, Camera, Scene
-from traitbrdf.shapes import Mesh, sphere, teapot
+from traitbrdf.scene.camera import MAX_SIDE, Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene.scene import GROUND, Scene, _pattern
+from traitbrdf.scene.shapes import Mesh, sphere
+from traitbrdf.scene.teapot import teapot
 
 SKY = EnvironmentMap.sky(rows=16)
 cameras = st.builds(
@@ -279,7 +280,7 @@ def test_antialiasing_finds_the_area_better():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 16, 256])
 def test_an_edge_along_the_axes_comes_out_in_equal_steps(count):
-    x, y = scene_module._pattern(count)
+    x, y = _pattern(count)
     steps = (np.arange(count) + 0.5) / count
     np.testing.assert_allclose(np.sort(x), steps)
     np.testing.assert_allclose(np.sort(y), steps)
@@ -744,7 +745,7 @@ def test_rays_are_cast_in_chunks(monkeypatch, small_teapot):
 
     whole = answers()
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(scene_module, "_CHUNK", 37)
+    monkeypatch.setattr("traitbrdf.scene.scene._CHUNK", 37)
     for a, b in zip(whole, answers(), strict=True):
         np.testing.assert_array_equal(a, b)
 

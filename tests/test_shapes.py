@@ -18,8 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion, binary_fill_holes
 from scipy.spatial import ConvexHull
 
-from traitbrdf.formats import FormatError
-from traitbrdf.shapes import MIN_COSINE, Hits, Mesh, Shape, load_mesh, sphere, teapot
+from traitbrdf.formats.files import FormatError
+from traitbrdf.scene.meshes import load_mesh
+from traitbrdf.scene.shapes import MIN_COSINE, Hits, Mesh, Shape, sphere
+from traitbrdf.scene.teapot import teapot
 
 SCALES = [1e-6, 1.0, 1e6]
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])

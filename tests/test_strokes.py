@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from traitbrdf.strokes import Stroke, follow, region_weights
+from traitbrdf.design.strokes import Stroke, follow, region_weights
 
 coordinate = st.floats(-30.0, 70.0)
 point = st.tuples(coordinate, coordinate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
@@ -23,14 +24,16 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import traitbrdf as tb
-from traitbrdf import editing
-from traitbrdf.editing import EditSession
-from traitbrdf.formats import Display, exposure_of, tone_map
-from traitbrdf.strokes import Stroke, follow
+from traitbrdf.cli import main
+from traitbrdf.design.strokes import Stroke, follow
+from traitbrdf.formats.display import Display, exposure_of, tone_map
+from traitbrdf.session import editing, preparation
+from traitbrdf.session.editing import EditSession
+from traitbrdf.session.preparation import Prepared
 from traitbrdf.studio import studio
 from traitbrdf.studio.page import Server, application, pack, unpack
 from traitbrdf.studio.session import LARGEST, Session
-from traitbrdf.transport import Transport
+from traitbrdf.transport.transport import Transport
 
 BRUSH = {"trait": "shiny", "amount": -0.6, "radius": 2.0, "stay": True}
 
@@ -38,17 +41,17 @@ BRUSH = {"trait": "shiny", "amount": -0.6, "radius": 2.0, "stay": True}
 @pytest.fixture(scope="module")
 def prepared(small_teapot, training):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(editing, "_training", lambda library, seed: training)
+        patch.setattr(preparation, "training_of", lambda library, seed: training)
         return EditSession(small_teapot, quality="preview", cache=False).prepare()
 
 
 @pytest.fixture
 def session(prepared, training, tmp_path, monkeypatch):
     """Over a prepared teapot, of one material."""
-    monkeypatch.setattr(editing, "_training", lambda library, seed: training)
+    monkeypatch.setattr(preparation, "training_of", lambda library, seed: training)
     edit = EditSession(prepared.scene, quality="preview", cache=False)
     again = Transport.restored(prepared.scene, prepared.grid, prepared.arrays())
-    edit._view.prepared = editing._Prepared(again, False, {}, again)
+    edit._view.prepared = Prepared(again, False, {}, again)
     session = Session(edit, tmp_path)
     yield session
     session.close()
@@ -328,7 +331,7 @@ def test_a_preparation_that_fails_is_told(session, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("no rays today")
 
-    monkeypatch.setattr(editing, "_prepare", fail)
+    monkeypatch.setattr(editing, "prepare_view", fail)
     ask(session, orbit=[15.0, 0.0])
     session._refiner.join(60.0)
     assert "no rays today" in frame(ask(session, dragging=True))["state"]["trouble"]
@@ -336,7 +339,7 @@ def test_a_preparation_that_fails_is_told(session, monkeypatch):
 
 def test_exact_frames_are_made_when_asked_for(session):
     edit = session.edit
-    edit.error = 1e-9  # nothing meets that
+    edit.settings = dataclasses.replace(edit.settings, error=1e-9)  # nothing meets that
     state = frame(ask(session))["state"]
     assert set(state["doubtful"]) == set(edit.scene.parts[: len(edit.scene.shape.parts)])
     state = frame(ask(session, exact=True))["state"]
@@ -750,3 +753,12 @@ def test_the_front_end_by_itself():
     test = Path(__file__).with_name("canvas.test.mjs")
     done = subprocess.run([node, "--test", str(test)], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_canvas_says_what_it_needs(small_sphere, monkeypatch, capsys):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    needed = r"needs the package anywidget.*traitbrdf\[studio\]"
+    with pytest.raises(RuntimeError, match=needed):
+        tb.studio(tb.EditSession(small_sphere))
+    assert main(["studio"]) == 1
+    assert "traitbrdf[studio]" in capsys.readouterr().err

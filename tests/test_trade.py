@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from traitbrdf import bench, trade
+from traitbrdf.bench import trade
+from traitbrdf.bench.datasets import default_data
+from traitbrdf.bench.trade import _Point, coarser, knee, knot, pareto, vase
 from traitbrdf.cli import main
-from traitbrdf.lights import EnvironmentMap
-from traitbrdf.trade import _Point, coarser, knee, knot, pareto, vase
+from traitbrdf.scene.lights import EnvironmentMap
 
 
 def point(milliseconds, error, megabytes=1.0):
@@ -101,7 +102,7 @@ def test_the_trade_is_printed_written_and_drawn(tmp_path, capsys):
 def test_promises_are_held_against_the_oracle(capsys):
     """Small and few: the full figures are the bench's."""
     said = []
-    records = list(trade.promises_kept(bench.default_data(), True, said.append))
+    records = list(trade.promises_kept(default_data(), True, said.append))
     shares = {r.name: r.value for r in records if "meet it" in r.name}
     assert len(shares) == 2
     assert min(shares.values()) >= 0.9

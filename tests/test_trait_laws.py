@@ -10,13 +10,11 @@ import math
 import numpy as np
 import pytest
 
-from traitbrdf import trait_laws
-from traitbrdf.descriptors import read
-from traitbrdf.embedding import default_library
-from traitbrdf.lights import EnvironmentMap
-from traitbrdf.trait_laws import (
+from traitbrdf.bench.people import spearman
+from traitbrdf.bench.traits import (
     AMOUNTS,
     FALL,
+    LIGHTER,
     REACHED,
     STARTS,
     TURN,
@@ -34,12 +32,14 @@ from traitbrdf.trait_laws import (
     read_tables,
     rendered_steps,
     scores_read,
-    spearman,
     starting,
     sweep,
     unrelated_change,
 )
-from traitbrdf.traits import COLOURS, LIGHT, default_traits
+from traitbrdf.reflectance.descriptors import read
+from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.library import default_library
+from traitbrdf.space.traits import COLOURS, LIGHT, default_traits
 
 SPACE = default_traits()
 PLAIN = [name for name in SPACE.names if name not in COLOURS]
@@ -194,7 +194,7 @@ def test_hues_stay_where_they_are_held(half):
 def test_lightness_stays_where_it_is_held(half):
     still = half.among(name for name in PLAIN if name not in LIGHT)
     assert len(still.trait) == 2 * len(STARTS) * len(set(PLAIN) - LIGHT)
-    assert np.mean(np.abs(still.lighter) <= trait_laws.LIGHTER) >= 0.9
+    assert np.mean(np.abs(still.lighter) <= LIGHTER) >= 0.9
 
 
 def test_moves_reach_what_is_asked_for():

@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from traitbrdf.brdf import TabulatedBRDF
-from traitbrdf.descriptors import DESCRIPTORS, cielab, descriptors, hue
-from traitbrdf.embedding import GRID, default_embedding, default_library
-from traitbrdf.trait_laws import RATINGS, rated_materials, spearman
-from traitbrdf.traits import COLOURS, KEEPS_BODY, LIGHT, Trait, TraitSpace, default_traits, suggest
+from traitbrdf.bench.people import RATINGS, rated_materials, spearman
+from traitbrdf.reflectance.brdf import TabulatedBRDF
+from traitbrdf.reflectance.descriptors import DESCRIPTORS, cielab, descriptors, hue
+from traitbrdf.space.embedding import GRID
+from traitbrdf.space.learning import Trait, suggest
+from traitbrdf.space.library import default_embedding, default_library
+from traitbrdf.space.traits import COLOURS, KEEPS_BODY, LIGHT, TraitSpace, default_traits
 
 EMBEDDING = default_embedding()
 LIBRARY = default_library()

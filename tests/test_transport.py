@@ -10,17 +10,23 @@ import numpy as np
 import pytest
 import torch
 
-from traitbrdf import reference, transport
-from traitbrdf.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf import reference
 from traitbrdf.directions import reflect
-from traitbrdf.embedding import GRID, default_library
-from traitbrdf.lights import DirectionalLight, EnvironmentMap, LightTree, PointLight
-from traitbrdf.measured import MeasuredBRDF
-from traitbrdf.models import AshikhminShirley, Lambert
-from traitbrdf.quadrature import Operator
-from traitbrdf.scene import Camera, Scene
-from traitbrdf.shapes import sphere, teapot
-from traitbrdf.transport import Draft, Training, Transport, training_tables
+from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
+from traitbrdf.reflectance.measured import MeasuredBRDF
+from traitbrdf.reflectance.models import AshikhminShirley, Lambert
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import sphere
+from traitbrdf.scene.teapot import teapot
+from traitbrdf.space.embedding import GRID
+from traitbrdf.space.library import default_library
+from traitbrdf.transport.basis import Training, damping_of, leading, training_tables
+from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.operator import Operator
+from traitbrdf.transport.transport import Transport
 
 LIBRARY = default_library()
 NAMES = ("chrome", "blue-plastic", "green-felt", "red-rubber", "gold-satin")
@@ -273,7 +279,7 @@ def test_grey_light_takes_one_channel(grey_light, training, monkeypatch):
     assert len(one.arrays()["rows_0"]) == (1 if grey_light else 3)
     if not grey_light:
         return
-    monkeypatch.setattr(transport, "_is_grey", lambda scene: False)
+    monkeypatch.setattr("traitbrdf.transport.transport._is_grey", lambda scene: False)
     three = Transport(scene, GRID, training, rank=24)
     assert 2.0 * one.bytes < three.bytes
     for table in TABLES:
@@ -763,10 +769,10 @@ def test_a_pixel_far_above_the_subset_does_not_fill_the_basis():
     generator = torch.Generator().manual_seed(4)
     images = torch.randn(3, 2000, 16, generator=generator)
     images[:, 1234] *= 1e5
-    damping = transport._damping(images)
+    damping = damping_of(images)
     usual = torch.arange(2000) != 1234
     assert damping[1234] < 2e-4
     assert (damping[usual] == 1.0).all()
-    basis = transport._leading(images * damping[:, None], 48, 1e-6)
+    basis = leading(images * damping[:, None], 48, 1e-6)
     torch.testing.assert_close(basis.T @ basis, torch.eye(48), rtol=0.0, atol=1e-4)
     assert (basis[1234] ** 2).sum() < 0.9

@@ -21,11 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import traitbrdf as tb
-from traitbrdf import bench, trade, trait_laws
-from traitbrdf.brdf import ALBEDO_ANGLES, Reflectance
-from traitbrdf.formats import exposure_of, tone_map, unknown_name, write_exr, write_png
-from traitbrdf.shapes import Shape
-from traitbrdf.strokes import follow
+from traitbrdf.bench.records import NAMES, ON_REQUEST
+from traitbrdf.design.strokes import follow
+from traitbrdf.formats.display import exposure_of, tone_map
+from traitbrdf.formats.files import unknown_name
+from traitbrdf.formats.images import write_exr, write_png
+from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, Reflectance
+from traitbrdf.scene.shapes import Shape
+from traitbrdf.studio import need_packages
 
 DEMO_MATERIAL = "red-rubber"
 GALLERY = ("blue-plastic", "gold-polished", "red-rubber")
@@ -138,8 +141,8 @@ def _parser() -> argparse.ArgumentParser:
     timing = commands.add_parser("bench", help="errors and times, measured in one run")
     timing.add_argument(
         "names", nargs="*", metavar="NAME",
-        help=f"of {', '.join(_benches())} "
-        f"(default: all but {', '.join(sorted(bench.ON_REQUEST))})",
+        help=f"of {', '.join(NAMES)} "
+        f"(default: all but {', '.join(sorted(ON_REQUEST))})",
     )  # fmt: skip
     timing.add_argument(
         "--peers", action="store_true",
@@ -405,7 +408,8 @@ def _material(name: str) -> str | Reflectance:
 
 
 def _angles(given: argparse.Namespace) -> int:
-    from traitbrdf.gallery import angle_map
+    # torch comes with it
+    from traitbrdf.pictures import angle_map
 
     given.out.parent.mkdir(parents=True, exist_ok=True)
     seen = tb.EditSession(_scene(given)).angles(given.part)
@@ -415,7 +419,8 @@ def _angles(given: argparse.Namespace) -> int:
 
 
 def _gallery(given: argparse.Namespace) -> int:
-    from traitbrdf.gallery import sheet
+    # torch comes with it
+    from traitbrdf.pictures import sheet
 
     library, space = tb.default_library(), tb.default_traits()
     traits = list(space.names) if "all" in given.trait else given.trait
@@ -454,6 +459,7 @@ def _gallery(given: argparse.Namespace) -> int:
 
 
 def _studio(given: argparse.Namespace) -> int:
+    need_packages()
     # a web server, which no other command needs
     from traitbrdf.studio.page import Server
     from traitbrdf.studio.session import Session
@@ -519,18 +525,13 @@ def _info(given: argparse.Namespace) -> int:
     return 0
 
 
-def _benches(out: Path | None = None) -> dict[str, bench.Bench]:
-    """All benches by name; `out` is the folder for what the trade writes."""
-    return {
-        **bench.BENCHES,
-        "traits": trait_laws.trait_laws,
-        "promises": trade.promises_kept,
-        "trade": functools.partial(trade.trade, out=out),
-    }
-
-
 def _bench(given: argparse.Namespace) -> int:
-    benches = _benches(given.out)
+    # loaded where it is asked for: torch and all the rest come with it
+    from traitbrdf.bench.datasets import default_data
+    from traitbrdf.bench.run import BENCHES, Bench, run
+    from traitbrdf.bench.trade import trade
+
+    benches: dict[str, Bench] = {**BENCHES, "trade": functools.partial(trade, out=given.out)}
     for name in given.names:
         if name not in benches:
             raise ValueError(unknown_name("bench", name, tuple(benches)))
@@ -540,10 +541,10 @@ def _bench(given: argparse.Namespace) -> int:
         raise FileNotFoundError(f"--data: no such folder: {given.data}")
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
-    data = given.data or bench.default_data()
+    data = given.data or default_data()
     if data is None:
         print("no folder of real maps and materials: under the procedural sky, without RGL")
-    records = bench.run(names, data, given.quick, lambda line: print(line, flush=True), benches)
+    records = run(names, data, given.quick, lambda line: print(line, flush=True), benches)
     if given.json is not None:
         given.json.write_text(json.dumps([r.as_dict() for r in records], indent=1) + "\n")
     return 0

@@ -25,11 +25,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from traitbrdf.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.directions import half_diff_angles, reflect, to_local
-from traitbrdf.formats import exposure_of, tone_map
-from traitbrdf.lights import EnvironmentMap, Light, PointLight, texel_moments, turn_about_y
-from traitbrdf.scene import Scene
+from traitbrdf.formats.display import exposure_of, tone_map
+from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.scene.lights import EnvironmentMap, Light, PointLight, texel_moments, turn_about_y
+from traitbrdf.scene.scene import Scene
 
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -33,8 +33,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from chrome import CHROMIUM, FLAGS, KERNEL_IDLE, RUN_ALL, STUDIO, jupyter_lab, write_notebook
 
 import traitbrdf as tb
-from traitbrdf.bench import default_data
-from traitbrdf.strokes import follow
+from traitbrdf.bench.datasets import default_data
+from traitbrdf.design.strokes import follow
 from traitbrdf.studio.page import Server
 from traitbrdf.studio.session import Session
 

@@ -6,11 +6,22 @@ over a notebook's kernel, ``page.py`` over a WebSocket, and ``canvas.js`` is the
 
 from __future__ import annotations
 
+import importlib.util
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from traitbrdf.editing import EditSession
+    from traitbrdf.session.editing import EditSession
     from traitbrdf.studio.widget import Canvas
+
+
+def need_packages() -> None:
+    """Raise RuntimeError where a package of the extra "studio" is missing."""
+    for name in ("anywidget", "starlette", "uvicorn", "websockets"):
+        if importlib.util.find_spec(name) is None:
+            raise RuntimeError(
+                f"the canvas needs the package {name}, which is missing: "
+                'pip install "traitbrdf[studio]"'
+            )
 
 
 def studio(edit: EditSession) -> Canvas:
@@ -25,9 +36,17 @@ def studio(edit: EditSession) -> Canvas:
     Returns
     -------
     anywidget.AnyWidget, with the session as ``.session``
+
+    Raises
+    ------
+    TypeError
+        If `edit` is no session.
+    RuntimeError
+        If the packages of the extra "studio" are not installed.
     """
+    need_packages()
     # a notebook's packages take longer to import than all of this one, and so does torch
-    from traitbrdf.editing import EditSession
+    from traitbrdf.session.editing import EditSession
     from traitbrdf.studio.widget import Canvas
 
     if not isinstance(edit, EditSession):

@@ -60,10 +60,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from traitbrdf.editing import EditSession
-from traitbrdf.formats import Display, exposure_of, unknown_name
-from traitbrdf.scene import Camera
-from traitbrdf.strokes import Stroke
+from traitbrdf.design.strokes import Stroke
+from traitbrdf.formats.display import Display, exposure_of
+from traitbrdf.formats.files import unknown_name
+from traitbrdf.scene.camera import Camera
+from traitbrdf.session.editing import EditSession
+from traitbrdf.space.traits import default_traits
 
 Header = dict[str, Any]
 Reply = tuple[Header, list[bytes]]
@@ -414,10 +416,10 @@ class Session:
             known = sorted(p.name for p in self.folder.glob("*.tbr"))
             raise ValueError(unknown_name("design", path.name, known))
         old = self.edit
-        self.edit = EditSession.load(
-            path, library=old.library, traits=old.traits, quality=old.quality, error=old.error,
-            device=old.device, seed=old.seed,
-        )  # fmt: skip
+        # what was promised, and traits of one's own, are the design's
+        self.edit = EditSession.load(path, library=old.library, device=old.device)
+        if self.edit.traits is default_traits():
+            self.edit.traits = old.traits
         old.cancel()
         self._give_up()
         self._light = None

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import anywidget
 
-from traitbrdf.editing import EditSession
+from traitbrdf.session.editing import EditSession
 from traitbrdf.studio.page import Server
 from traitbrdf.studio.session import Session
 

@@ -1,0 +1,1 @@
+"""The document: what is painted, as plain values."""

@@ -1,0 +1,1 @@
+"""Bytes in and out, and nothing else: files, images, BRDF files, and what a screen shows."""

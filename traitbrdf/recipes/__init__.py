@@ -1,0 +1,1 @@
+"""Procedural materials by family and seed."""

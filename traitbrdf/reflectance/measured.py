@@ -1,0 +1,243 @@
+"""Measured isotropic materials of the RGL database.
+
+Dupuy & Jakob, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering"
+(ACM TOG 37(6), 2018), sections 4 and 5. A measurement is stored on a unit square that a density of
+visible normals (the vndf, one per elevation of the first direction) warps to the half vectors, so
+that its nodes crowd where the material reflects.
+
+Known weaknesses: the stored quantity includes the cosine of the second direction; dividing it out
+amplifies noise and interpolation error next to the horizon, where also the instrument saw nothing
+and the data are extrapolated.
+"""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from traitbrdf.directions import Array, as_directions
+from traitbrdf.formats.brdfs import RGLFields, read_rgl
+from traitbrdf.formats.files import FormatError, stem
+
+Float64 = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MIN_COS = 1e-3
+"""Floor of the cosine that is divided out; lower only within 0.06 degrees of the horizon."""
+
+_CHUNK = 1 << 15  # pairs of directions at a time: bounds the temporaries to some 30 MB
+
+
+class MeasuredBRDF:
+    """A measured isotropic BRDF, evaluated in its own parametrisation.
+
+    Parameters
+    ----------
+    fields : traitbrdf.formats.brdfs.RGLFields
+        Of an isotropic material, which has one azimuth (or two, of which the first is taken: the
+        azimuth of the first direction is free).
+    name : str
+
+    Raises
+    ------
+    ValueError
+        If the material is anisotropic.
+
+    Notes
+    -----
+    With g(wi, wo) the stored quantity, f cos(theta_o), the value is the mean of
+    g(wi, wo) / cos(theta_o) and g(wo, wi) / cos(theta_i), reciprocal by construction; cosines are
+    floored at `MIN_COS`. Negative values, colours out of gamut, are set to 0 before that.
+    """
+
+    def __init__(self, fields: RGLFields, name: str = "") -> None:
+        if len(fields.phi_i) > 2:
+            raise ValueError(
+                f"fields: expected an isotropic material (1 azimuth), got {len(fields.phi_i)}"
+            )
+        self.name = name
+        self.description = fields.description
+        self._theta_i = fields.theta_i.astype(np.float64)
+        self._u_phi_i = (float(fields.phi_i[0]) + math.pi) / (2.0 * math.pi)
+        self._sigma = fields.sigma.astype(np.float64)[None, ..., None]
+        self._ndf = fields.ndf.astype(np.float64)[None, ..., None]
+        self._jacobian = fields.jacobian
+        self._rgb = np.moveaxis(fields.rgb[0].astype(np.float64), 1, -1).copy()
+        self._warp = _Warp(fields.vndf[0].astype(np.float64))
+
+    def __repr__(self) -> str:
+        return f"MeasuredBRDF({self.name!r})"
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> MeasuredBRDF:
+        """Read a ``.bsdf`` file, named after the file.
+
+        Raises
+        ------
+        FileNotFoundError
+        traitbrdf.formats.files.FormatError
+            If the file is no RGB material of that format, or an anisotropic one.
+        """
+        fields = read_rgl(path)
+        if len(fields.phi_i) > 2:
+            raise FormatError(
+                path, "an isotropic material (1 azimuth)", f"{len(fields.phi_i)} azimuths"
+            )
+        return cls(fields, stem(path))
+
+    @property
+    def mirror(self) -> Float64:
+        """Weight (3,) of a perfect mirror beside `eval`: none."""
+        return np.zeros(3)
+
+    def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
+        """f_r in 1/sr, without the cosine; 0 where a direction is not above the horizon.
+
+        Parameters
+        ----------
+        wi, wo : (..., 3) array_like
+            Local unit directions to the light and to the viewer.
+
+        Returns
+        -------
+        (..., 3) float64
+            Finite, not negative, linear Rec.709 RGB.
+        """
+        wi, wo = np.broadcast_arrays(as_directions(wi, "wi"), as_directions(wo, "wo"))
+        f = np.zeros(wi.shape)
+        above = (wi[..., 2] > 0.0) & (wo[..., 2] > 0.0)
+        a, b = wi[above].astype(np.float64), wo[above].astype(np.float64)
+        values = np.empty(a.shape)
+        for start in range(0, len(a), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            values[part] = self._reciprocal(a[part], b[part])
+        f[above] = values
+        return f
+
+    def _reciprocal(self, wi: Float64, wo: Float64) -> Float64:
+        half = wi + wo
+        forward = self._stored(wi, half) / np.maximum(wo[:, 2:], MIN_COS)
+        backward = self._stored(wo, half) / np.maximum(wi[:, 2:], MIN_COS)
+        return np.asarray(0.5 * (forward + backward))
+
+    def _stored(self, first: Float64, half: Float64) -> Float64:
+        """f times the cosine of the other direction, (n, 3), for the half vectors (any length)."""
+        theta_i, phi_i = _spherical(first)
+        theta_m, phi_m = _spherical(half)
+        turn = (phi_m - phi_i) / (2.0 * math.pi) + 0.5
+        y = turn - np.floor(turn)
+        x = np.sqrt(theta_m * (2.0 / math.pi))
+        low, weight = self._elevation(theta_i)
+        value = _bilinear(self._rgb, low, weight, *self._warp.invert(x, y, low, weight))
+        value = np.maximum(value, 0.0)
+        if self._jacobian:
+            zero = np.zeros_like(low)
+            u_phi = np.full_like(x, self._u_phi_i)
+            u_theta = np.sqrt(theta_i * (2.0 / math.pi))
+            sigma = _bilinear(self._sigma, zero, None, u_theta, u_phi)
+            value = value * _bilinear(self._ndf, zero, None, x, y) / (4.0 * sigma)
+        return value
+
+    def _elevation(self, theta_i: Float64) -> tuple[Index, Float64 | None]:
+        """The elevation below (index) and the weight of the next; clamped at both ends."""
+        nodes = self._theta_i
+        if len(nodes) == 1:
+            return np.zeros(theta_i.shape, np.int64), None
+        low = np.clip(np.searchsorted(nodes, theta_i, "right") - 1, 0, len(nodes) - 2)
+        weight = (theta_i - nodes[low]) / (nodes[low + 1] - nodes[low])
+        return low, np.clip(weight, 0.0, 1.0)
+
+
+class _Warp:
+    """The inverse of sampling a bilinear density: rows by the marginal, then columns.
+
+    Distributions of elevations are normalised first and then interpolated, densities and sums
+    alike, as section 5 and the authors' own reader have it.
+
+    Parameters
+    ----------
+    density : (slices, rows, columns) float64, not negative
+    """
+
+    def __init__(self, density: Float64) -> None:
+        slices, rows, columns = density.shape
+        along = np.zeros((slices, rows, columns))
+        np.cumsum(0.5 * (density[..., 1:] + density[..., :-1]), axis=-1, out=along[..., 1:])
+        marginal = np.zeros((slices, rows))
+        row_mass = along[..., -1]
+        np.cumsum(0.5 * (row_mass[:, 1:] + row_mass[:, :-1]), axis=-1, out=marginal[:, 1:])
+        total = marginal[:, -1]
+        self._density = density / total[:, None, None]
+        self._along = along / total[:, None, None]
+        self._marginal = marginal / total[:, None]
+
+    def invert(
+        self, x: Float64, y: Float64, low: Index, weight: Float64 | None
+    ) -> tuple[Float64, Float64]:
+        """The point of the unit square that sampling would have carried to (x, y), all (n,)."""
+        _, rows, columns = self._density.shape
+        column, row = x * (columns - 1), y * (rows - 1)
+        i = np.clip(column.astype(np.int64), 0, columns - 2)
+        j = np.clip(row.astype(np.int64), 0, rows - 2)
+        s, t = column - i, row - j
+
+        def across(table: Float64, at: Index) -> Float64:
+            """Between the rows j and j + 1, at column `at`."""
+            below, above = (_slices(table, low, weight, r * columns + at) for r in (j, j + 1))
+            return np.asarray((1.0 - t) * below + t * above)
+
+        c0, c1 = across(self._density, i), across(self._density, i + 1)
+        last = np.full_like(i, columns - 1)
+        r0, r1 = (_slices(self._along, low, weight, r * columns + last) for r in (j, j + 1))
+        mass = (1.0 - t) * r0 + t * r1
+        u = across(self._along, i) + s * (c0 + 0.5 * s * (c1 - c0))
+        # a row without mass is never sampled: any point of it will do
+        u = np.where(mass > 0.0, u / np.where(mass > 0.0, mass, 1.0), x)
+        v = _slices(self._marginal, low, weight, j) + t * (r0 + 0.5 * t * (r1 - r0))
+        return np.clip(u, 0.0, 1.0), np.clip(v, 0.0, 1.0)
+
+
+def _spherical(w: Float64) -> tuple[Float64, Float64]:
+    """Polar angle and azimuth (n,) of vectors (n, 3) of any length."""
+    polar = np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2])
+    return np.asarray(polar), np.asarray(np.arctan2(w[:, 1], w[:, 0]))
+
+
+def _slices(table: Float64, low: Index, weight: Float64 | None, at: Index) -> Float64:
+    """Element `at` of every flattened slice `low` of `table`, blended with the next slice."""
+    flat = table.reshape(-1)
+    size = math.prod(table.shape[1:])
+    index = low * size + at
+    if weight is None:
+        return np.asarray(flat[index])
+    return np.asarray((1.0 - weight) * flat[index] + weight * flat[index + size])
+
+
+def _bilinear(
+    table: NDArray[Any], low: Index, weight: Float64 | None, x: Float64, y: Float64
+) -> Float64:
+    """Interpolate a (slices, rows, columns, channels) table at x (columns) and y (rows) in [0, 1].
+
+    Returns
+    -------
+    (n, channels) float64
+    """
+    _, rows, columns, channels = table.shape
+    flat = table.reshape(-1, channels)
+    column, row = x * (columns - 1), y * (rows - 1)
+    i = np.clip(column.astype(np.int64), 0, columns - 2)
+    j = np.clip(row.astype(np.int64), 0, rows - 2)
+    s, t = (column - i)[:, None], (row - j)[:, None]
+    value = np.zeros((len(x), channels))
+    shares = [(0, None)] if weight is None else [(0, 1.0 - weight), (1, weight)]
+    for step, share in shares:
+        index = ((low + step) * rows + j) * columns + i
+        patch = (1.0 - t) * ((1.0 - s) * flat[index] + s * flat[index + 1]) + t * (
+            (1.0 - s) * flat[index + columns] + s * flat[index + columns + 1]
+        )
+        value += patch if share is None else share[:, None] * patch
+    return value

@@ -1,0 +1,489 @@
+"""A scene: a shape under lights, seen by a camera, as fragments of its image."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from traitbrdf.scene.camera import MAX_SUBSAMPLES, Camera, dots, image_size
+from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, Light, PointLight
+from traitbrdf.scene.shapes import Hits, Shape
+
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+GROUND = "ground"
+"""Name of the part that `Scene(..., ground=True)` adds."""
+
+_GROUND_RADIUS = 2.0  # in radii of the shape, unless told
+_CHUNK = 1 << 16  # rays in one call: some 15 ms in which no other thread gets its turn
+_CREASE = math.cos(math.radians(40.0))  # neighbours whose normals differ by more share an edge
+_JUMP = 3.0  # pixels; neighbours that lie further off each other's plane share an edge
+_LIGHT_MARGIN = 1e-5  # of the distance; what is so near to a point light does not hide it
+_SEEN = (
+    "part_image", "uncovered", "pixels", "pixel_part", "weights", "bordering", "offsets",
+    "normals", "views", "positions", "starts", "_sample_part", "_bounds",
+)  # fmt: skip
+
+
+class Scene:
+    """A shape under light, seen by a camera.
+
+    What is shaded are *fragments*, each one part within one pixel. A fragment is sampled once, at
+    the pixel's centre; where the pixel lies at a border of parts, at a silhouette or a crease, it
+    holds as many of `subsamples` samples as hit the part.
+
+    The ground receives the shape's shadows but hides nothing of the map from the shape: the lower
+    half of a captured map *is* the floor's own light, and hiding it would leave undersides black.
+    Point and directional lights beneath the ground do not shine through it.
+
+    Parameters
+    ----------
+    shape : what is looked at
+    environment : EnvironmentMap or None
+        None is `EnvironmentMap.sky()`.
+    lights : point and directional lights beside the map
+    camera : Camera
+        It looks at the shape; the ground changes nothing about the framing.
+    size : int or (height, width)
+        Pixels, 1 to 16384 on a side.
+    ground : bool or float
+        Whether a horizontal disc, the part "ground", lies under the shape's lowest point; a
+        number is its radius in radii of the shape, True is 2. From below it is not seen.
+    shadows : bool
+        Whether the shape hides light from itself and from the ground, and the ground from the
+        shape.
+    subsamples : int
+        Rays through a pixel at a border, 1 to 256; 1 turns antialiasing off.
+
+    Attributes
+    ----------
+    parts : tuple of str
+        The shape's parts, and "ground" where there is one.
+    ground : False or float
+        The ground's radius in radii of the shape.
+    casts : tuple of bool
+        Whether rays are needed to tell what light reaches each part.
+    rays_cast : int
+        Shadow rays cast so far.
+    part_image : (height, width) int32
+        Index of the part at each pixel's centre; -1 for none.
+    uncovered : (height * width,) float32
+        Share of each pixel that shows the backdrop: 1 less the weights of its fragments.
+    pixels : (P,) int64
+        Flat pixel index of each fragment, part by part, ascending in each.
+    pixel_part : (P,) int32
+        Index of the part of each fragment.
+    weights : (P,) float64
+        Share of its pixel that each fragment covers, above 0, at most 1.
+    bordering : (P,) bool
+        Whether the fragment lies in a pixel at a border.
+    offsets : (P + 1,) int64
+        The samples of fragment f are `offsets[f]` to `offsets[f + 1]`; they all count the same.
+    normals, views, positions, starts : (N, 3) float64
+        Of the samples: world unit normals facing the viewer, unit directions towards the viewer,
+        positions, and where shadow rays start.
+
+    Raises
+    ------
+    ValueError, TypeError
+        On a size, ground radius or number of subsamples out of range, on lights that are none, or
+        where the shape has a part named "ground" of its own.
+    """
+
+    part_image: Int32
+    uncovered: NDArray[np.float32]
+    pixels: Int64
+    pixel_part: Int32
+    weights: Float64
+    bordering: Bool
+    offsets: Int64
+    normals: Float64
+    views: Float64
+    positions: Float64
+    starts: Float64
+    _sample_part: Int32
+    _bounds: list[int]
+
+    def __init__(
+        self,
+        shape: Shape,
+        environment: EnvironmentMap | None = None,
+        lights: Sequence[Light] = (),
+        camera: Camera | None = None,
+        size: int | tuple[int, int] = 512,
+        ground: bool | float = False,
+        shadows: bool = True,
+        subsamples: int = 8,
+    ) -> None:
+        if not callable(getattr(shape, "intersect", None)):
+            raise TypeError(f"shape: expected a shape such as teapot(), got {shape!r}")
+        if camera is not None and not isinstance(camera, Camera):
+            raise TypeError(f"camera: expected a Camera, got {camera!r}")
+        if (
+            not isinstance(subsamples, (int, np.integer))
+            or isinstance(subsamples, bool)
+            or not 1 <= subsamples <= MAX_SUBSAMPLES
+        ):
+            raise ValueError(
+                f"subsamples: expected a whole number from 1 to {MAX_SUBSAMPLES}, "
+                f"got {subsamples!r}"
+            )
+        self.height, self.width = image_size(size)
+        self.shape = shape
+        self.camera = Camera.orbit(35.0, 20.0) if camera is None else camera
+        self.ground = _ground_radius(ground)
+        self.subsamples = int(subsamples)
+        self.parts = tuple(shape.parts)
+        if self.ground:
+            if GROUND in self.parts:
+                raise ValueError(f"ground: expected a shape without a part {GROUND!r}, got one")
+            self.parts = (*self.parts, GROUND)
+        self._light(environment, lights, shadows)
+
+    def __getattr__(self, name: str) -> Any:
+        # primary rays are shot when something first asks for what they hit: a scene of which only
+        # a small version is drawn yet costs none
+        if name in _SEEN:
+            self._see()
+            return self.__dict__[name]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def _light(
+        self, environment: EnvironmentMap | None, lights: Sequence[Light], shadows: bool
+    ) -> None:
+        """Take the settings that the primary rays do not depend on."""
+        if environment is not None and not isinstance(environment, EnvironmentMap):
+            raise TypeError(f"environment: expected an EnvironmentMap, got {environment!r}")
+        for light in lights:
+            if not isinstance(light, (PointLight, DirectionalLight)):
+                raise TypeError(f"lights: expected point or directional lights, got {light!r}")
+        if not isinstance(shadows, (bool, np.bool_)):
+            raise TypeError(f"shadows: expected True or False, got {shadows!r}")
+        self.environment = EnvironmentMap.sky() if environment is None else environment
+        self.lights = tuple(lights)
+        self.shadows = bool(shadows)
+        self.rays_cast = 0
+        # seen from within, even a convex shape hides the world
+        stands = self.camera.position(self.shape, self.height, self.width)
+        outside = math.dist(stands, self.shape.center) > self.shape.radius
+        hides = self.shadows and not (outside and self.shape.convex)
+        own = (hides,) * len(self.shape.parts)
+        self.casts: tuple[bool, ...] = (*own, self.shadows) if self.ground else own
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({self.width}x{self.height}, {np.count_nonzero(self.uncovered < 1.0)} covered "
+            f"pixels, {len(self.normals)} samples, parts={list(self.parts)})"
+        )
+
+    @property
+    def coverage(self) -> float:
+        """Fraction of the frame that the shape covers, the ground left out."""
+        own = slice(0, self.part_slice(len(self.shape.parts) - 1).stop)
+        return float(self.weights[own].sum()) / (self.height * self.width)
+
+    def part_slice(self, part: int) -> slice:
+        """Where in `pixels` the fragments of one part lie."""
+        return slice(self._bounds[part], self._bounds[part + 1])
+
+    def samples(self, index: NDArray[np.integer]) -> tuple[Int64, Int64, Float64]:
+        """The samples of fragments (m,), one fragment after the other.
+
+        Returns
+        -------
+        sample : (n,) int64 array
+            Index of each sample.
+        owner : (n,) int64 array
+            Which of the m fragments it belongs to, 0 to m - 1.
+        share : (n,) float64 array
+            Share of the pixel that it stands for; those of a fragment sum to its weight.
+        """
+        first = self.offsets[:-1][index]
+        count = self.offsets[1:][index] - first
+        owner = np.repeat(np.arange(len(count)), count)
+        ahead = np.cumsum(count) - count
+        sample = np.arange(len(owner)) + (first - ahead)[owner]
+        return sample, owner, (self.weights[index] / count)[owner]
+
+    def changed(self, **settings: Any) -> Scene:
+        """The same shape with other settings of the constructor; those not named stay.
+
+        Where only the light changes (environment, lights, shadows) this costs next to nothing.
+
+        Raises
+        ------
+        TypeError
+            On a name that is no setting, or as the constructor does.
+        ValueError
+            As the constructor does.
+        """
+        names = [*inspect.signature(Scene).parameters][1:]
+        unknown = sorted(settings.keys() - set(names))
+        if unknown:
+            raise TypeError(f"expected settings among {names}, got {unknown}")
+        kept: dict[str, Any] = {name: getattr(self, name) for name in names if name != "size"}
+        chosen = {**kept, "size": (self.height, self.width), **settings}
+        light = ("environment", "lights", "shadows")
+        if settings.keys() <= set(light):
+            result = copy.copy(self)
+            result._light(*(chosen[name] for name in light))
+            return result
+        return Scene(self.shape, **chosen)
+
+    def backdrop(self) -> NDArray[np.float32]:
+        """The frame (height, width, 3) without the object: the map seen through the camera."""
+        _, rays = self.camera.rays(self.shape, self.height, self.width)
+        return np.asarray(self.environment.backdrop(rays), np.float32)
+
+    # -- what light reaches a sample ------------------------------------------------------------
+
+    def visible(self, index: NDArray[np.integer], directions: NDArray[np.floating[Any]]) -> Bool:
+        """Whether light from infinitely far away reaches samples (m,) from `directions` (m, 3).
+
+        Directions are unit vectors towards the light. Those below the surface may count as
+        visible where no rays are needed (`casts`): the cosine rules them out.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, or directions that need rays are not of unit length.
+        """
+        index = np.asarray(index)
+        directions = np.asarray(directions)
+        if directions.shape != (*index.shape, 3):
+            raise ValueError(
+                f"directions: expected shape {(*index.shape, 3)}, got {directions.shape}"
+            )
+        free = np.ones(len(index), dtype=bool)
+        cast = self._cast_rows(index)
+        for rows in _chunks(len(index) if cast is None else len(cast)):
+            chosen = rows if cast is None else cast[rows]
+            self.rays_cast += rows.stop - rows.start
+            free[chosen] = ~self.shape.occluded(self.starts[index[chosen]], directions[chosen])
+        return free
+
+    def arriving(self, light: Light, index: NDArray[np.integer]) -> tuple[Float64, Float64]:
+        """Directions to a light and irradiance across them, (m, 3) each, at samples (m,).
+
+        Irradiance is zero where the light stands behind the surface or is hidden.
+        """
+        index = np.asarray(index)
+        toward, given = light.arriving(self.positions[index])
+        lit = (dots(toward, self.normals[index]) > 0.0) & given.any(axis=-1)
+        if self.shadows:
+            near = light.position if isinstance(light, PointLight) else None
+            if self.ground:
+                lit[lit] = ~self._under_ground(self.positions[index[lit]], toward[lit], near)
+            rows = np.flatnonzero(lit)
+            cast = self._cast_rows(index[rows])
+            rows = rows if cast is None else rows[cast]
+            for some in _chunks(len(rows)):
+                lit[rows[some]] = self._unhidden(index[rows[some]], toward[rows[some]], near)
+        return toward, np.where(lit[:, None], given, 0.0)
+
+    def _cast_rows(self, index: NDArray[np.integer]) -> Int64 | None:
+        """Which of samples (m,) need rays; None for all of them."""
+        if all(self.casts):
+            return None
+        if not any(self.casts):
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(np.asarray(self.casts)[self._sample_part[index]])
+
+    def _unhidden(
+        self,
+        index: NDArray[np.integer],
+        toward: Float64,
+        near: tuple[float, float, float] | None,
+    ) -> Bool:
+        """Whether the shape leaves a light free, from samples (n,): of one chunk of rays."""
+        self.rays_cast += len(index)
+        starts = self.starts[index]
+        if near is None:
+            return ~self.shape.occluded(starts, toward)
+        # from where the ray starts, the light stands elsewhere than from the surface
+        offset = np.asarray(near) - starts
+        largest = np.abs(offset).max(axis=-1, keepdims=True)
+        scaled = offset / np.where(largest == 0.0, 1.0, largest)  # its square cannot overflow
+        length = np.sqrt(dots(scaled, scaled))
+        at_light = length == 0.0
+        direction = scaled / np.where(at_light, 1.0, length)[:, None]
+        direction = np.where(at_light[:, None], toward, direction)
+        distance = length * largest[:, 0] * (1.0 - _LIGHT_MARGIN)
+        return ~self.shape.occluded(starts, direction, distance)
+
+    def _under_ground(
+        self, points: Float64, toward: Float64, near: tuple[float, float, float] | None
+    ) -> Bool:
+        """Whether the ground stands between points (n, 3) above it and a light."""
+        down = toward[:, 1] < 0.0
+        if near is not None:
+            down &= near[1] < self.shape.lowest
+        hidden: Bool = down & self._over_ground(points, toward)
+        return hidden
+
+    def _over_ground(self, points: Float64, rays: Float64) -> Bool:
+        """Whether downward rays (n, 3) from points (n, 3) above the ground meet its disc."""
+        # times the ray's slope, so that nothing is divided by a slope of next to zero
+        slope = np.abs(rays[:, 1:2])
+        height = points[..., 1:2] - self.shape.lowest
+        across = (points - self.shape.center) * slope + height * rays
+        inside: Bool = np.hypot(across[:, 0], across[:, 2]) <= (
+            self.ground * self.shape.radius * slope[:, 0]
+        )
+        return inside
+
+    # -- what the camera sees -------------------------------------------------------------------
+
+    def _see(self) -> None:
+        """Shoot the primary rays and sort what they hit into fragments."""
+        size = self.height * self.width
+        y, x = np.divmod(np.arange(size), self.width)
+        origin = self.camera.position(self.shape, self.height, self.width)
+        hits = self._shoot(origin, x + 0.5, y + 0.5)
+        border = np.zeros(size, dtype=bool)
+        if self.subsamples > 1:
+            border = self._borders(origin, hits)
+        inner = np.flatnonzero((hits.part >= 0) & ~border)
+        at_border = np.flatnonzero(border)
+        u, v = _pattern(self.subsamples)
+        fine_x = (x[at_border, None] + u).ravel()
+        fine_y = (y[at_border, None] + v).ravel()
+        fine = self._shoot(origin, fine_x, fine_y)
+        met = np.flatnonzero(fine.part >= 0)
+
+        pixel = np.concatenate([inner, np.repeat(at_border, self.subsamples)[met]])
+        part = np.concatenate([hits.part[inner], fine.part[met]])
+        # part by part, so that a part's fragments are one slice
+        order = np.argsort(part.astype(np.int64) * size + pixel, kind="stable")
+        pixel, part = pixel[order], part[order]
+
+        def gathered(name: str) -> Float64:
+            both = [getattr(hits, name)[inner], getattr(fine, name)[met]]
+            return np.concatenate(both)[order]
+
+        toward = self.camera.through(
+            self.height,
+            self.width,
+            np.concatenate([x[inner] + 0.5, fine_x[met]])[order],
+            np.concatenate([y[inner] + 0.5, fine_y[met]])[order],
+        )
+        new = np.ones(len(pixel) + 1, dtype=bool)
+        new[1:-1] = (pixel[1:] != pixel[:-1]) | (part[1:] != part[:-1])
+        new[-1] = True
+        offsets = np.flatnonzero(new) if len(pixel) else np.zeros(1, dtype=np.int64)
+        first, count = offsets[:-1], np.diff(offsets)
+        bordering = border[pixel[first]]
+        missed = (hits.part < 0).astype(np.float32)
+        missed[at_border] = np.mean(fine.part.reshape(-1, self.subsamples) < 0, axis=1)
+        # all at once: another thread may be asking
+        self.__dict__.update(
+            part_image=hits.part.reshape(self.height, self.width),
+            normals=gathered("normal"), positions=gathered("position"), starts=gathered("start"),
+            views=-toward, _sample_part=part, offsets=offsets, pixels=pixel[first],
+            pixel_part=part[first], bordering=bordering,
+            weights=np.where(bordering, count / self.subsamples, 1.0), uncovered=missed,
+            _bounds=np.searchsorted(part[first], np.arange(len(self.parts) + 1)).tolist(),
+        )  # fmt: skip
+
+    def _shoot(self, origin: Float64, x: Float64, y: Float64) -> Hits:
+        """What the camera at `origin` sees through image positions x, y (n,)."""
+        count = len(x)
+        hits = Hits(
+            np.full(count, -1, dtype=np.int32),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+        )
+        for rows in _chunks(count):
+            rays = self.camera.through(self.height, self.width, x[rows], y[rows])
+            found = self.shape.intersect(origin, rays)
+            hits.part[rows] = found.part
+            hits.position[rows] = found.position
+            hits.normal[rows] = found.normal
+            hits.start[rows] = found.start
+            if self.ground:
+                self._shoot_ground(origin, rays, rows, hits)
+        return hits
+
+    def _shoot_ground(self, origin: Float64, rays: Float64, rows: slice, hits: Hits) -> None:
+        """Add the ground to `hits[rows]`: from above, it lies behind all of the shape."""
+        lowest = self.shape.lowest
+        if origin[1] <= lowest:
+            return
+        free = np.flatnonzero((hits.part[rows] < 0) & (rays[:, 1] < 0.0))
+        free = free[self._over_ground(origin, rays[free])]
+        away = (lowest - origin[1]) / rays[free, 1:2]
+        position = origin + away * rays[free]
+        position[:, 1] = lowest
+        at = rows.start + free
+        hits.part[at] = len(self.parts) - 1
+        hits.normal[at] = (0.0, 1.0, 0.0)
+        hits.position[at] = position
+        hits.start[at] = position  # there is nothing in the ground that its rays might meet
+
+    def _borders(self, origin: Float64, hits: Hits) -> Bool:
+        """Mask (height * width,) of pixels in whose 3 x 3 neighbourhood something ends.
+
+        Another part or nothing is seen, the surface is bent sharply, or it goes on elsewhere.
+        """
+        frame = (self.height, self.width)
+        part = hits.part.reshape(frame)
+        normal = hits.normal.reshape(*frame, 3)
+        position = hits.position.reshape(*frame, 3)
+        offset = hits.position - origin
+        pixel = 2.0 * math.tan(math.radians(self.camera.fov) / 2) / self.height
+        reach = (_JUMP * pixel * np.sqrt(dots(offset, offset))).reshape(frame)
+        border = np.zeros(frame, dtype=bool)
+        every, later, sooner = slice(None), slice(1, None), slice(None, -1)
+        for a, b in (
+            ((every, sooner), (every, later)),
+            ((sooner, every), (later, every)),
+            ((sooner, sooner), (later, later)),
+            ((sooner, later), (later, sooner)),
+        ):
+            apart = position[b] - position[a]
+            ends = part[a] != part[b]
+            ends |= (part[a] >= 0) & (dots(normal[a], normal[b]) < _CREASE)
+            off = np.maximum(np.abs(dots(apart, normal[a])), np.abs(dots(apart, normal[b])))
+            ends |= off > np.maximum(reach[a], reach[b])
+            border[a] |= ends
+            border[b] |= ends
+        return border.ravel()
+
+
+def _chunks(count: int) -> list[slice]:
+    """Slices that make up `count` rays, none too long."""
+    return [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
+
+
+def _pattern(count: int) -> tuple[Float64, Float64]:
+    """Positions (count,), (count,) in the unit square, one in each of `count` rows and columns.
+
+    So edges along the axes come out in equal steps; the golden ratio tells the rows' order, which
+    spreads the positions well.
+    """
+    step = np.arange(count)
+    golden = (step * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0
+    return (step + 0.5) / count, (np.argsort(np.argsort(golden)) + 0.5) / count
+
+
+def _ground_radius(ground: bool | float) -> float | Literal[False]:
+    """Radius of the ground in radii of the shape; False for none."""
+    if isinstance(ground, (bool, np.bool_)):
+        return _GROUND_RADIUS if ground else False
+    number = isinstance(ground, (int, float, np.integer, np.floating))
+    if not (number and math.isfinite(ground) and ground > 0.0):
+        raise ValueError(
+            f"ground: expected True, False or a radius above 0 in radii of the shape, "
+            f"got {ground!r}"
+        )
+    return float(ground)

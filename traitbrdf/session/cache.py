@@ -1,0 +1,190 @@
+"""Prepared scenes on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import os
+import threading
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from platformdirs import user_cache_path
+
+from traitbrdf.formats.files import (
+    atomic_path,
+    read_arrays,
+)
+from traitbrdf.scene.scene import Scene
+from traitbrdf.scene.shapes import Mesh, Sphere
+from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.library import Library
+
+Float32 = NDArray[np.float32]
+
+CACHE_BYTES = 2_000_000_000
+"""Preparations on disk take at most so many bytes, unless TRAITBRDF_CACHE_BYTES says otherwise."""
+
+_CACHE_FORMAT = 2
+
+_COMPUTES = ("formats", "reflectance", "scene", "space", "transport", "session")
+"""Rooms whose code a preparation depends on."""
+
+
+def fingerprint(embedding: BRDFEmbedding) -> str:
+    digest = hashlib.sha256()
+    for name, value in sorted(embedding.arrays().items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _hash(*values: object) -> str:
+    """SHA-256 of arrays and of what has a faithful repr."""
+    digest = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            digest.update(f"{value.dtype}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).data)
+        else:
+            digest.update(repr(value).encode())
+    return digest.hexdigest()
+
+
+@functools.lru_cache(maxsize=1)
+def _code() -> str:
+    """A name of what computes: a result must not outlive the code that it came from."""
+    try:
+        version = importlib.metadata.version("traitbrdf")
+    except importlib.metadata.PackageNotFoundError:
+        version = ""
+    package = Path(str(resources.files("traitbrdf")))
+    files = [file for room in _COMPUTES for file in sorted((package / room).glob("**/*.py"))]
+    return _hash(version, *(file.read_bytes() for file in [package / "directions.py", *files]))
+
+
+def cache_key(
+    scene: Scene, library: Library, rank: int, resolution: float, seed: int
+) -> str | None:
+    """A name of all that a preparation depends on; None where that cannot be told."""
+    shape = scene.shape
+    geometry: tuple[object, ...]
+    if type(shape) is Mesh:
+        geometry = shape.vertices, shape.faces
+    elif type(shape) is Sphere or not any(scene.casts):
+        geometry = ()
+    else:
+        return None  # what casts shadows is known to the shape alone
+    return _hash(
+        _CACHE_FORMAT, _code(), fingerprint(library.embedding), library.coordinates,
+        rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
+        scene.ground, scene.shadows, np.asarray(shape.center), shape.radius, shape.lowest,
+        *geometry, scene.environment.image, scene.environment.rotation, scene.lights,
+        *(getattr(scene, name) for name in _FRAGMENTS),
+        # a mesh that was saved and loaded may differ in the last bit
+        *(getattr(scene, name).astype(np.float32) for name in _SAMPLES),
+    )  # fmt: skip
+
+
+def fixed_key(whole: str | None, fixed: Mapping[int, Float32]) -> str | None:
+    """The name of a preparation for the tables of fixed parts, from that of one for all edits."""
+    if whole is None or not fixed:
+        return whole
+    return _hash(whole, *(x for pair in fixed.items() for x in pair))
+
+
+_FRAGMENTS = ("pixels", "pixel_part", "weights", "bordering", "offsets")
+_SAMPLES = ("normals", "views", "positions", "starts")
+
+
+class Cache:
+    """Finished preparations on disk. A disk that is full, read-only or gone costs nothing but time.
+
+    Parameters
+    ----------
+    folder : where the files lie; made when the first is written
+    limit : bytes that they may take
+    """
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self.folder = folder
+        self.limit = limit
+
+    @classmethod
+    def usual(cls) -> Cache | None:
+        """The one that the environment variables describe; None where there is none."""
+        said = os.environ.get("TRAITBRDF_CACHE_BYTES", str(CACHE_BYTES))
+        try:
+            limit = int(said)
+        except ValueError:
+            limit = -1
+        if limit < 0:
+            raise ValueError(f"TRAITBRDF_CACHE_BYTES: expected a number of bytes, got {said!r}")
+        if limit == 0:
+            return None
+        chosen = os.environ.get("TRAITBRDF_CACHE")
+        if chosen:
+            return cls(Path(chosen), limit)
+        try:
+            folder = user_cache_path("traitbrdf", appauthor=False)
+        except RuntimeError:  # a user without a home
+            return None
+        return cls(folder, limit) if folder.is_absolute() else None
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.npz"
+
+    def read(self, key: str) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a key; None where there are none, or none that are whole."""
+        path = self._file(key)
+        try:
+            arrays = read_arrays(path)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, RuntimeError, MemoryError):  # damaged in whatever way
+            self.drop(key)
+            return None
+        with contextlib.suppress(OSError):  # a cache that is only read
+            os.utime(path)
+        return arrays
+
+    def drop(self, key: str) -> None:
+        with contextlib.suppress(OSError):
+            self._file(key).unlink(missing_ok=True)
+
+    def write_behind(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write in a thread of its own, so that the first frame need not wait.
+
+        The interpreter's end waits for it: a program that shows one frame would else never fill
+        the cache.
+        """
+        thread = threading.Thread(target=self.write, args=(key, arrays), name="traitbrdf-cache")
+        with contextlib.suppress(RuntimeError):  # the interpreter is ending
+            thread.start()
+
+    def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write the arrays, and remove the least recently used files beyond the limit."""
+        if sum(a.nbytes for a in arrays.values()) > self.limit:
+            return
+        with contextlib.suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with atomic_path(self._file(key)) as temporary, temporary.open("wb") as file:
+                # compressing takes as long as preparing anew
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            self._trim()
+
+    def _trim(self) -> None:
+        """What a cut-off process left half written goes like all others: by its age."""
+        found = [(path.stat(), path) for path in self.folder.glob("*.npz")]
+        total = sum(stat.st_size for stat, _ in found)
+        for stat, path in sorted(found, key=lambda pair: pair[0].st_mtime_ns):
+            if total <= self.limit:
+                return
+            path.unlink(missing_ok=True)
+            total -= stat.st_size

@@ -1,0 +1,135 @@
+"""Views, and the frames that were shown in them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.scene import Scene
+from traitbrdf.session.canvas import Canvas
+from traitbrdf.session.materials import Material
+from traitbrdf.session.preparation import Preparation, Prepared
+from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.transport import PartFrame, Transport
+
+Float32 = NDArray[np.float32]
+
+FRAMES_KEPT = 1 << 27
+"""Bytes of finished parts that are kept, so that what is undone is shown again as it was."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """The call that did an edit.
+
+    A stroke lies on the image: where the picture has been framed anew since, `anywhere` says the
+    same part by part. It is put into words when it is asked for: while it is painted, nobody does.
+    """
+
+    call: str | Callable[[], str]
+    anywhere: str = ""
+    framing: tuple[Camera, int, int] | None = None
+
+    def under(self, framing: tuple[Camera, int, int]) -> str:
+        if self.anywhere and framing != self.framing:
+            return self.anywhere
+        return self.call if isinstance(self.call, str) else self.call()
+
+
+def move_call(
+    part: str | list[str],
+    amounts: Mapping[str, float],
+    hold: tuple[str, ...] | None,
+    photoreal: bool = True,
+) -> str:
+    said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
+    held = "" if hold is None else f", hold={hold!r}"
+    freely = "" if photoreal else ", photoreal=False"
+    return f"edit.move({part!r}{said}{held}{freely})"
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One undoable step: the materials before and after, and the call that did it."""
+
+    before: dict[str, Material]
+    after: dict[str, Material]
+    said: Said
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One part's shading as it is shown, how it was made, and what that took."""
+
+    frame: PartFrame
+    tier: Literal["basis", "trained", "exact"]
+    seconds: float
+
+
+class Drafted(NamedTuple):
+    """A draft's image (h, w, 3) and measured error, and of what it is."""
+
+    size: int
+    materials: tuple[Material, ...]
+    image: Float32
+    error: float
+
+
+@dataclass(eq=False)
+class View:
+    """All that belongs to one scene of the session: the next look replaces it as a whole."""
+
+    scene: Scene
+    job: Preparation | None = None
+    prepared: Prepared | None = None
+    canvas: Canvas | None = None
+    shown: list[Shown] = field(default_factory=list)
+    kept: OrderedDict[tuple[int, Material], Shown] = field(default_factory=OrderedDict)
+    kept_bytes: int = 0
+    trained: dict[int, int] = field(default_factory=dict)
+    budget: dict[int, int] = field(default_factory=dict)
+    floor: dict[int, float] = field(default_factory=dict)
+    exact_frames: int = 0
+    draft: tuple[int, Draft] | None = None
+    drafted: Drafted | None = None
+    times: dict[str, float] = field(default_factory=dict)
+
+    def keep(self, index: int, material: Material, shown: Shown) -> None:
+        """Keep a part's shading, the least recently used ones going first."""
+        old = self.kept.pop((index, material), None)
+        self.kept_bytes -= 0 if old is None else _size(old)
+        self.kept[index, material] = shown
+        self.kept_bytes += _size(shown)
+        while self.kept_bytes > FRAMES_KEPT and len(self.kept) > len(self.scene.parts):
+            _, old = self.kept.popitem(last=False)
+            self.kept_bytes -= _size(old)
+
+
+def _size(shown: Shown) -> int:
+    return shown.frame.radiance.numel() * shown.frame.radiance.element_size()
+
+
+def measured(view: View, transport: Transport) -> float:
+    """Error of the frame that was shown last."""
+    return transport.frame_error([one.frame for one in view.shown])
+
+
+def framing_of(scene: Scene) -> tuple[Camera, int, int]:
+    """Where on the image things lie."""
+    return scene.camera, scene.height, scene.width
+
+
+def enlarged(image: Float32, height: int, width: int) -> Float32:
+    """A copy of an image (h, w, 3) at another size, bilinear between pixel centres."""
+    if image.shape[:2] == (height, width):
+        return image.copy()
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
+    whole = torch.nn.functional.interpolate(planes, (height, width), mode="bilinear")
+    return whole[0].permute(1, 2, 0).contiguous().numpy()

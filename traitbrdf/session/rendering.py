@@ -1,0 +1,142 @@
+"""Frames of a prepared view: by the basis where it is trusted, exactly elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from traitbrdf.session.canvas import Canvas
+from traitbrdf.session.frames import Shown, View
+from traitbrdf.session.materials import Material
+from traitbrdf.session.preparation import TURNS, trusted_error
+from traitbrdf.session.settings import Settings
+from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.transport.transport import PartFrame, Transport
+
+Float32 = NDArray[np.float32]
+
+TRAINED_IMAGES = 8
+"""At most so many exact images are taken into a basis."""
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Makes frames as exact as was asked for.
+
+    Parameters
+    ----------
+    embedding : what decodes materials
+    settings : what was asked for
+    """
+
+    embedding: BRDFEmbedding
+    settings: Settings
+
+    def frame(
+        self,
+        view: View,
+        transport: Transport,
+        materials: Sequence[Material],
+        exact: bool = True,
+    ) -> Float32:
+        """The frame (H, W, 3) of a prepared view with a material for each part; what is shown is
+        kept with the view. Unless `exact`, the basis has the last word."""
+        start = time.perf_counter()
+        tables: dict[Material, torch.Tensor] = {}
+        wanted = Counter(m for i, m in enumerate(materials) if (i, m) not in view.kept)
+        shown = [
+            self._shade(view, transport, i, material, tables, wanted[material] == 1, exact)
+            for i, material in enumerate(materials)
+        ]
+        if view.canvas is None:
+            view.canvas = Canvas(transport)
+        view.canvas.draw([one.frame for one in shown])
+        view.shown = shown
+        image = view.canvas.image()
+        view.times["frame"] = time.perf_counter() - start
+        return image
+
+    def _shade(
+        self,
+        view: View,
+        transport: Transport,
+        index: int,
+        material: Material,
+        tables: dict[Material, torch.Tensor],
+        alone: bool,
+        exact: bool,
+    ) -> Shown:
+        """One part's shading; `tables` holds what was decoded for this frame, and `alone` says
+        that only this part wants its material's. Unless `exact`, the basis has the last word."""
+        known = view.kept.get((index, material))
+        if known is not None and not (
+            exact and known.tier != "exact" and known.frame.error > self.allowed(view, index)
+        ):
+            view.kept.move_to_end((index, material))
+            return known
+        start = time.perf_counter()
+        if material not in tables:
+            values = material.values(self.embedding, transport.cells)
+            tables[material] = torch.from_numpy(values).to(self.settings.place)
+        mirror = None
+        if material.mirror.any():
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
+        frame = transport.shade(index, tables[material], mirror, alone)
+        tier: Literal["basis", "trained", "exact"] = "basis"
+        part = transport.parts[index]
+        if part is not None and part.group in view.budget:
+            tier = "trained"
+        if exact and frame.error > self.allowed(view, index):
+            frame, tier = self._exactly(view, transport, index, material, mirror), "exact"
+            tables.clear()  # the transport may see other cells by now
+        shown = Shown(frame, tier, time.perf_counter() - start)
+        view.keep(index, material, shown)
+        return shown
+
+    def allowed(self, view: View, index: int) -> float:
+        """The measured error up to which a part is shown by the basis."""
+        if self.settings.quality == "reference":
+            return -1.0
+        if self.settings.fps is not None:
+            return math.inf
+        # nothing is gained by exact frames that err as much
+        allowed = trusted_error(view.scene, index, self.settings.error)
+        return max(allowed, view.floor.get(index, 0.0)) if self.settings.error is None else allowed
+
+    def _exactly(
+        self,
+        view: View,
+        transport: Transport,
+        index: int,
+        material: Material,
+        mirror: torch.Tensor | None,
+    ) -> PartFrame:
+        """A part without the basis; its image is taken into the basis for the edits to come."""
+        values = material.values(self.embedding)
+        part = transport.parts[index]
+        with TURNS.urgent():
+            frame = transport.shade_exactly(index, values)
+            if frame.error > trusted_error(view.scene, index):
+                view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
+            allowed = self.allowed(view, index)
+            budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)
+            # where even exact frames miss the error asked for, the basis cannot meet it
+            if part is not None and budget > 0 and frame.error <= allowed:
+                transport.train(index, frame.radiance)
+                table = torch.from_numpy(values[transport.cells]).to(self.settings.place)
+                met = transport.shade(index, table).error <= allowed
+                view.trained[index] = view.trained.get(index, 0) + 1
+                # each image makes all frames slower: few of those that do not help
+                view.budget[part.group] = budget - (1 if met else TRAINED_IMAGES // 2)
+        view.exact_frames += 1
+        if mirror is None or part is None:
+            return frame
+        return replace(frame, radiance=frame.radiance + mirror * part.mirror)

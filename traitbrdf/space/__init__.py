@@ -1,0 +1,1 @@
+"""Materials as points: the library, its embedding, traits and moves."""

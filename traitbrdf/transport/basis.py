@@ -1,0 +1,221 @@
+"""The few images that frames are made of, and the tables they are fitted to.
+
+For a fixed view and light, radiance is linear in the BRDF (Ben-Artzi, Overbeck & Ramamoorthi 2006,
+section 3), so all frames lie in the span of the images of a training set.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from traitbrdf.reflectance.brdf import HalfDiffGrid
+from traitbrdf.reflectance.models import (
+    GGX,
+    AshikhminShirley,
+    BoundedPhong,
+    BoundedTorranceSparrow,
+    Lambert,
+    Model,
+    NormalizedPhong,
+    OrenNayar,
+    Sheen,
+    TorranceSparrowSimplified,
+)
+from traitbrdf.transport.operator import Operator as Operator
+from traitbrdf.transport.visibility import Progress as Progress
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+_PIECE = 4096
+"""Fragments whose rows of a basis are widened at a time."""
+
+TOP = {torch.float32: 1.0, torch.bfloat16: 1.0, torch.float16: 2.0**14}
+"""The types a basis is kept in, and the largest number that its columns are scaled to."""
+
+
+@dataclass
+class Basis:
+    """The compressed operator of a group of parts; C is 3, or 1 where all light is grey."""
+
+    parts: range
+    basis: torch.Tensor  # Q (P, r), of all colours; of whatever type it is kept in
+    damping: torch.Tensor  # (P,) what the fit of a fragment was weighted with
+    cells: torch.Tensor  # (n,) the cells of the grid that the group sees
+    rows: torch.Tensor  # (C, r + m, n): the projection, and the probes' exact rows below it
+    place: torch.Tensor | None = None  # (n,) where the cells are among the scene's; None: all
+
+    @property
+    def rank(self) -> int:
+        return self.basis.shape[-1]
+
+    @property
+    def projection(self) -> torch.Tensor:
+        """(C, r, n) a table's coefficients."""
+        return self.rows[:, : self.rank]
+
+    @property
+    def probes(self) -> torch.Tensor:
+        """(C, m, n) exact rows of the probes."""
+        return self.rows[:, self.rank :]
+
+    def at_cells(self, table: torch.Tensor) -> torch.Tensor:
+        """(3, n) of a table (len(Transport.cells), 3)."""
+        return (table if self.place is None else table[self.place]).T.contiguous()
+
+    def images(self, fragments: slice, coefficients: torch.Tensor) -> torch.Tensor:
+        """(P, 3) float32: Q of some of its fragments times coefficients (3, r)."""
+        chosen = self.basis[fragments]
+        if chosen.dtype == torch.float32:
+            return chosen @ coefficients.T
+        # sums of half precision would lose what cancels; a piece at a time, as caches hold it
+        pieces = torch.split(chosen, _PIECE)
+        return torch.cat([piece.float() @ coefficients.T for piece in pieces])
+
+    def stored(self, dtype: torch.dtype) -> Basis:
+        """The same with Q in another type, each column scaled to fill its range; the scales go
+        into the projection."""
+        basis = self.basis.float()
+        if dtype == torch.float32:
+            return replace(self, basis=basis)
+        size = basis.abs().amax(dim=0) if len(basis) else basis.new_ones(self.rank)
+        scale = torch.where(size > 0.0, TOP[dtype] / size.clamp_min(1e-30), 1.0)
+        rows = self.rows.clone()
+        rows[:, : self.rank] /= scale[:, None]
+        return replace(self, basis=(basis * scale).to(dtype), rows=rows)
+
+
+@dataclass(frozen=True)
+class Training:
+    """Scalar tables (cells, T) float32 that a basis is fitted to, and what each counts (T,)."""
+
+    tables: Float32
+    weight: Float64
+
+
+def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Training:
+    """What a frame has to be able to show.
+
+    The library's channels; every model family at log-spaced parameters; and copies of both under
+    smooth random fields in log f ("curve moves"), which count a tenth: measured materials are
+    no library members, and these keep their error from growing tenfold.
+
+    Parameters
+    ----------
+    library : (grid.size, n) float32, channels of library members
+    grid : HalfDiffGrid
+    seed : draws the fields
+    """
+    families: list[Model] = [Lambert(0.5)]
+    families += [OrenNayar(0.5, sigma) for sigma in (0.3, 0.9)]
+    families += [Sheen(0.5, alpha) for alpha in (0.3, 0.55, 1.0)]
+    for s in np.geomspace(2.0, 2e4, 17):
+        families += [BoundedPhong(0.5, float(s)), NormalizedPhong(0.5, float(s))]
+    for s in np.geomspace(0.007, 0.6, 17):
+        families += [
+            BoundedTorranceSparrow(0.5, float(s)),
+            TorranceSparrowSimplified(0.5, float(s)),
+        ]
+    for alpha in np.geomspace(0.005, 1.0, 17):
+        families += [GGX(float(alpha), eta, k) for eta, k in ((1.5, 0.0), (0.2, 3.0), (2.5, 4.0))]
+    for n in np.geomspace(3.0, 2e4, 12):
+        families += [AshikhminShirley(0.0, r, float(n), float(n)) for r in (0.05, 0.9)]
+    wi, wo = grid.node_directions()
+    known = [library] + [m.eval(wi, wo)[..., 1].reshape(-1, 1) for m in families]
+    plain = np.concatenate(known, axis=1).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(plain.shape[1], 300)
+    fields = _smooth_fields(grid, len(chosen), rng)
+    varied = plain[:, chosen] * np.exp(fields)
+    weight = np.concatenate([np.ones(plain.shape[1]), np.full(len(chosen), 0.1)])
+    weight[library.shape[1]] = 30.0  # Lambert, the first of the families, lies in every basis
+    return Training(np.concatenate([plain, varied], axis=1), weight)
+
+
+def _smooth_fields(grid: HalfDiffGrid, count: int, rng: np.random.Generator) -> Float32:
+    """(cells, count) random sums of low cosines over the table, of amplitude about 1."""
+    u = np.sqrt(grid.theta_h / (math.pi / 2))
+    v = grid.theta_d / (math.pi / 2)
+    waves = [
+        np.einsum("i,j,l->ijl", np.cos(math.pi * a * u), np.cos(math.pi * b * v),
+                  np.cos(2 * c * grid.phi_d)).ravel() / (1.0 + a + 1.5 * b + 2.0 * c)
+        for a in range(5) for b in range(4) for c in range(3)
+    ]  # fmt: skip
+    stack = np.stack(waves, axis=1).astype(np.float32)
+    mix = rng.normal(size=(stack.shape[1], count)).astype(np.float32)
+    return 0.5 * (stack @ mix)
+
+
+def per_colour(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """(C, a, b) times (3, b), colour by colour; one matrix (C = 1) serves all three."""
+    if len(matrices) == 1:
+        return (matrices[0] @ vectors.T).T
+    # a batched product of matrices with vectors is four times slower
+    return torch.stack([torch.mv(matrices[c], vectors[c]) for c in range(3)])
+
+
+def eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Eigenvalues, ascending, and eigenvectors, on one thread.
+
+    Several threads would meet at thousands of barriers, and where other work shares the cores each
+    of them costs a time slice: seconds for what one thread does in milliseconds.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        values, vectors = torch.linalg.eigh(symmetric)
+    finally:
+        torch.set_num_threads(threads)
+    return values, vectors
+
+
+def damping_of(images: torch.Tensor) -> torch.Tensor:
+    """Factors (P,) for images (C, P, R), 1 but for pixels that stand far above the others.
+
+    At grazing views, or where one pixel of thousands mirrors the sun, unbounded lobes make a
+    pixel's images exceed the others' a thousandfold. It would then fill the basis alone.
+    """
+    size = (images**2).sum(dim=(0, 2)).sqrt()
+    usual = size.mean()
+    for _ in range(8):  # the mean of what is left of them, whatever stands out
+        usual = size.minimum(10.0 * usual).mean()
+    return torch.where(size > 10.0 * usual, 10.0 * usual / size.clamp_min(1e-30), 1.0)
+
+
+def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
+    """The leading left singular vectors (P, r) of images (C, P, R), all columns together.
+
+    At most `rank` of them, and none whose singular value is less than `enough` of the largest.
+    """
+    count, size = images.shape[0] * images.shape[2], images.shape[1]
+    gram = torch.zeros((count, count), dtype=torch.float64)
+    pieces = [slice(start, start + 8192) for start in range(0, size, 8192)]
+    for piece in pieces:  # singular values over eight decades: single precision would lose four
+        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        gram += columns.T @ columns
+    squares, vectors = eigh(gram)
+    squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
+    kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
+    turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
+    basis = torch.empty((size, kept))
+    for piece in pieces:
+        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        basis[piece] = (columns @ turn).float()
+    return basis
+
+
+def extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+    """An orthonormal basis (P, r) and what images (P, 3) add to it."""
+    known, fresh = basis.double(), images.double()
+    fresh = fresh / fresh.norm(dim=0).clamp_min(1e-30)
+    for _ in range(2):  # the second pass removes what rounding left of the first
+        fresh = fresh - known @ (known.T @ fresh)
+    squares, vectors = eigh(fresh.T @ fresh)
+    keep = squares > 1e-10  # grey light, or an image that is known already, adds fewer
+    fresh = (fresh @ vectors[:, keep]) * squares[keep].rsqrt()
+    return torch.cat([basis, fresh.float()], dim=1)

@@ -1,0 +1,550 @@
+"""Rows of the transport operator: the light that reaches a pixel, cut into leaves of one tree.
+
+For one pixel I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d): linear in the table's
+cells. A *leaf* is a piece of the environment map with its exact vector irradiance. `Operator`
+turns leaves into rows (a weight for every cell) or, far cheaper, into images of given tables.
+
+*Leaves.* The map is walked as a tree (`LightTree`; Walter et al. 2005): a node of light stands for
+its texels where it looks small from the mirror peak, measured in half-vector space; a texel that
+looks large is cut further. A node's irradiance is exact, and its own extent is carried into theta_h
+to second order (two samples one standard deviation apart), so the error falls with the fourth power
+of the node size while the number of nodes grows with its inverse square.
+
+*Shadows.* A cut through the tree, some thousand nodes of little light each, gets one shadow ray a
+node (`VisibilityCut`), bright lights down to single texels. Neighbouring pixels see nearly the same
+occluders: rays are cast on a coarse lattice of pixels, and between lattice points only where those
+around disagree; at borders, where a pixel's samples lie on either side of an edge, of every sample.
+Near the mirror direction, where a glossy surface shows the occluder's outline, leaves at that
+outline cast their own rays.
+
+*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel: they are
+computed on the lattice and interpolated, wherever normals and shadows vary linearly over its
+cells; elsewhere, and for the narrow rest, every pixel is computed. The two are separated by a
+smooth window over theta_h, so their sum is exact.
+
+References
+----------
+B. Walter, S. Fernandez, A. Arbree, K. Bala, M. Donikian, D. Greenberg, "Lightcuts: a scalable
+approach to illumination", ACM Transactions on Graphics 24(3), 2005: cuts through a tree of lights.
+S. Rusinkiewicz, "A new change of variables for efficient BRDF representation", EGWR 1998.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from traitbrdf.directions import reflect
+from traitbrdf.reflectance.brdf import HalfDiffGrid
+from traitbrdf.scene.lights import EnvironmentMap, turn_about_y
+from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.kernels import interpolate_masks, one_leaf, shade_rows
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.visibility import (
+    Bundles,
+    Plan,
+    Progress,
+    Visibility,
+    VisibilityCut,
+    alike_masks,
+    centres,
+    expand,
+    first_rows,
+    questions,
+)
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+f32 = np.float32
+
+_SPLIT = (0.15, 0.35)
+"""theta_h in radians between which the window passes from near to far, at a scale of 1."""
+
+_FLAT = 0.03
+"""How much of their largest value tables may change within the width of their lobes."""
+
+_OUTLINE = 0.03
+"""theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
+
+_CUT = (0.09, 1 / 500)
+"""Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
+
+_QUESTIONS = 192
+"""Most rays of its own that a sample casts at occluders' outlines."""
+
+CORE = 3e-3
+"""theta_h in radians: leaves at a mirror peak are as small as peaks of twice that width need."""
+
+SHARPEST = 1e-4
+"""The same for the narrowest peaks that a table holds."""
+
+_ALL = (-1.0, 9.0)
+
+_SHARED = ((4, 0.002), (2, 0.007))
+"""Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
+
+_UNITED = 0.007
+"""The same for the samples of one fragment."""
+
+
+class Operator:
+    """Rows of W: what every cell of a table contributes to a fragment of the scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    grid : HalfDiffGrid of the "folded" layout
+    resolution : float
+        1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
+    tree : what `light_tree` makes of the scene's map, if it is at hand
+    core : float
+        In radians, half the width in theta_h of the narrowest peak that rows and interpolated
+        images resolve. Exact images resolve what their tables hold.
+    shadows : float or None
+        The same as `resolution` for the visibility nodes alone; None: as that has it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        grid: HalfDiffGrid,
+        resolution: float = 1.0,
+        tree: LightTree | None = None,
+        core: float = CORE,
+        shadows: float | None = None,
+    ) -> None:
+        if grid.layout != "folded":
+            raise ValueError(f"grid: expected the 'folded' layout, got {grid.layout!r}")
+        for name, given in (("resolution", resolution), ("core", core), ("shadows", shadows)):
+            if given is not None and not (math.isfinite(given) and given > 0.0):
+                raise ValueError(f"{name}: expected a positive number, got {given!r}")
+        self.scene = scene
+        self.grid = grid
+        self.resolution = resolution
+        self.core = core
+        environment = _divided(scene.environment)
+        rows, columns, _ = environment.image.shape
+        if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
+            tree = LightTree.build(environment)
+        self.tree = tree
+        self._nodes = self.tree.packed
+        self._image = environment.image
+        scale = 1.0 / resolution
+        # sharp lobes are lost where the leaves at their peaks grow wider than these
+        rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
+        border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
+        # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
+        # need leaves of half that size
+        fine = border * (0.5 / 1.6, 1.0, 1.0, 1.0)
+        self._rules = np.stack([rule, border]).astype(np.float32)
+        self._exact_rules = np.stack([rule, fine]).astype(np.float32)
+        self._capacity = int(1600 * resolution**2) + 200
+        to_map = scene.environment.to_map
+        self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
+        self._views = np.ascontiguousarray(to_map(scene.views), np.float32)
+        # the sample that stands for a fragment where one must: the middle one
+        self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
+        self._visibility: Visibility | None = None
+        if any(scene.casts):
+            wide = 1.0 / (resolution if shadows is None else shadows)
+            width = min(wide, math.sqrt(wide))  # shadows blur less well than lobes do
+            cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
+            self._visibility = Visibility(scene, cut, self._middle)
+        self._plans: dict[int, Plan] = {}
+
+    # -- single fragments -----------------------------------------------------------------------
+
+    def rows(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
+        at = np.asarray(index, np.int64)
+        out = np.zeros((len(at), 3, self.grid.size), np.float32)
+        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._add_lights(out, at, _NO_TABLES)
+        return out
+
+    def rows_as_shown(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3, grid.size) rows of distinct fragments `index` (m,), as `part_images` sees them.
+
+        With the shadows and the leaves that they share with the pixels around: the images and
+        these rows are of one operator, while those of `rows` are a little nearer to the truth.
+        """
+        at = np.asarray(index, np.int64)
+        out = np.zeros((len(at), 3, self.grid.size), np.float32)
+        for part in range(len(self.scene.parts)):
+            span = self.scene.part_slice(part)
+            mine = np.flatnonzero((at >= span.start) & (at < span.stop))
+            if not len(mine):
+                continue
+            place = np.full(span.stop - span.start, -1)
+            place[at[mine] - span.start] = mine
+            everything = np.arange(span.start, span.stop)
+            masks = self._plan(part).mask_rows
+            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
+        self._add_lights(out, at, _NO_TABLES)
+        return out
+
+    def images(self, index: NDArray[np.integer], tables: Float32) -> Float32:
+        """(m, 3, T) radiance of the fragments `index` (m,) under scalar tables (grid.size, T)."""
+        at = np.asarray(index, np.int64)
+        tables = np.ascontiguousarray(tables, np.float32)
+        out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
+        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=self._core_of(tables))
+        self._add_lights(out, at, tables)
+        return out
+
+    def mirror(self, index: NDArray[np.integer]) -> Float32:
+        """(m, 3) what a perfect mirror shows at the fragments `index` (m,)."""
+        scene = self.scene
+        index = np.asarray(index, np.int64)
+        sample, owner, share = scene.samples(index)
+        toward = np.asarray(reflect(scene.views[sample], scene.normals[sample]), np.float64)
+        seen = scene.environment.radiance(toward) * scene.visible(sample, toward)[:, None]
+        out = np.zeros((len(index), 3))
+        np.add.at(out, owner, seen * share[:, None])
+        return out.astype(np.float32)
+
+    def _core_of(self, tables: Float32) -> float:
+        return min(self.core, _core(self.grid, tables))
+
+    # -- whole parts ----------------------------------------------------------------------------
+
+    def part_images(
+        self,
+        part: int,
+        tables: Float32,
+        progress: Progress | None = None,
+        interpolate: bool = True,
+    ) -> Float32:
+        """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
+
+        Shadows are interpolated where rays agree, and far images where that is safe, unless
+        `interpolate` is False: an order of magnitude faster than `images`. Lobes that are wide
+        for the part have nothing but far images, and no leaves finer than they need. Peaks narrower
+        than the operator's `core` are resolved only without interpolation.
+        """
+        report = progress or (lambda stage, fraction: None)
+        span = self.scene.part_slice(part)
+        index = np.arange(span.start, span.stop)
+        tables = np.ascontiguousarray(tables, np.float32)
+        if len(index) == 0:
+            return np.zeros((0, 3, tables.shape[1]), np.float32)
+        plan = self._plan(part, report)
+        # narrower lobes are interpolated where neighbouring pixels differ less
+        nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
+        low, high = (float(self.grid.theta_h[node]) for node in nodes)
+        lobe = _lobe(self.grid, tables, plan.grazing)
+        broad = lobe >= high  # nothing is near
+        if not interpolate and not broad:
+            out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
+            self._shade(
+                out, index, plan.mask_rows, _ALL, tables,
+                lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
+                core=self._core_of(tables),
+            )  # fmt: skip
+            self._add_lights(out, index, tables)
+            return out
+        near = np.repeat(_near_window(self.grid, low, high), self.grid.size // self.grid.shape[0])
+        wide, far = (tables, _ALL) if broad else (tables * (1.0 - near)[:, None], (low, 9.0))
+        coarse = np.zeros((len(plan.computed), 3, tables.shape[1]), np.float32)
+        computed = index[plan.computed]
+        self._shade(
+            coarse, computed, self._own_rows(computed), far, wide,
+            lambda fraction: report("far images", fraction), lobe=lobe,
+        )  # fmt: skip
+        out = np.empty((len(index), 3, tables.shape[1]), np.float32)
+        interpolate_masks(out, coarse, plan.corners, plan.weights)
+        if not broad:
+            self._shade(
+                out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
+                lambda fraction: report("near images", fraction), lobe=lobe,
+            )  # fmt: skip
+        self._add_lights(out, index, tables)
+        return out
+
+    # -- leaves ---------------------------------------------------------------------------------
+
+    def _bundles(self, index: Int64, mask_rows: NDArray[np.int32]) -> Bundles:
+        """The samples of fragments `index`, in groups that share one walk through the light."""
+        scene = self.scene
+        sample, owner, share = scene.samples(index)
+        count = np.bincount(owner, minlength=len(index))
+        starts = np.concatenate([[0], np.cumsum(count)])
+        normals, views = self._normals[sample], self._views[sample]
+        single = np.flatnonzero(count == 1)
+        x, y = scene.pixels[index] % scene.width, scene.pixels[index] // scene.width
+        part = scene.pixel_part[index].astype(np.int64)
+        group = np.full(len(index), -1, np.int64)  # of fragments of one sample
+        found = 0
+        for side, limit in _SHARED:
+            key = (part[single] * (scene.height + side) + y[single] // side) * (
+                scene.width + side
+            ) + x[single] // side
+            order = np.argsort(key, kind="stable")
+            member = single[order]
+            edge = np.flatnonzero(np.diff(key[order], prepend=-1))
+            if not len(edge):
+                break
+            size = np.diff(edge, append=len(member))
+            alike = alike_masks(
+                edge, size, normals[starts[member]], views[starts[member]],
+                scene.positions[sample[starts[member]]], mask_rows[member], limit,
+            ) & (size > 1)  # fmt: skip
+            joined = np.repeat(alike, size)
+            group[member[joined]] = found + np.repeat(np.arange(alike.sum()), size[alike])
+            found += int(alike.sum())
+            single = np.sort(member[~joined])
+        # a bundle is a group of fragments, or one fragment, whose samples are a group each, or one
+        sampled = np.flatnonzero(count > 1)
+        united = np.zeros(len(index), bool)
+        if len(sampled):
+            members, edge = expand(starts, sampled)
+            united[sampled] = alike_masks(
+                edge[:-1], count[sampled], normals[members], views[members],
+                scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
+            )  # fmt: skip
+        own_row = np.full(len(sample), -1, np.int32)
+        if self._visibility is not None:
+            own_row = self._visibility.row_of_sample[sample]
+            united[owner[own_row >= 0]] = False
+        alone = group < 0
+        group[alone] = found + np.arange(alone.sum())
+        order = np.argsort(group, kind="stable")
+        sorted_samples, _ = expand(starts, order)
+        per_fragment = count[order]
+        bundle_of_sample = np.repeat(group[order], per_fragment)
+        own = (bundle_of_sample >= found) & ~united[owner[sorted_samples]]
+        fresh = np.diff(bundle_of_sample, prepend=-1) != 0
+        group_edge = np.flatnonzero(fresh | own)
+        group_start = np.append(group_edge, len(sorted_samples))
+        bundle_start = np.append(np.flatnonzero(fresh[group_edge]), len(group_edge))
+        target = owner[sorted_samples]
+        several = (count > 2)[target[group_edge]]
+        masks = mask_rows[target]
+        single_row = own_row[sorted_samples]
+        masks[single_row >= 0] = -1
+        masks[single_row >= 0, 0] = single_row[single_row >= 0]
+        return Bundles(
+            bundle_start, group_start, target, normals[sorted_samples], views[sorted_samples],
+            share[sorted_samples].astype(np.float32), sample[sorted_samples],
+            *centres(group_start, normals[sorted_samples], views[sorted_samples]),
+            first_rows(group_start, masks), several,
+        )  # fmt: skip
+
+    def _light(
+        self, window: tuple[float, float], exact: bool, lobe: float, core: float
+    ) -> tuple[Any, ...]:
+        """What the walk needs beside the samples: nodes, masks and rules."""
+        low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
+        cut, masks = _NO_CUT, _NO_MASKS
+        if self._visibility is not None:
+            cut = (self._visibility.cut.first, self._visibility.cut.last)
+            masks = self._visibility.masks
+        rules = np.concatenate(
+            [self._exact_rules if exact else self._rules, np.full((2, 1), core, np.float32)], axis=1
+        )
+        return (
+            *self._nodes, self._image, *cut, *masks, rules,
+            f32(low), f32(high if high < 1.0 else 9.0),
+            f32(math.sin(_OUTLINE) if lobe <= _SPLIT[1] else -9.0), f32(math.sin(lobe)),
+        )  # fmt: skip
+
+    def _shade(
+        self,
+        out: Float32,
+        index: Int64,
+        mask_rows: NDArray[np.int32],
+        window: tuple[float, float],
+        tables: Float32,
+        report: Callable[[float], None] = lambda fraction: None,
+        place: Int64 | None = None,
+        exact: bool = False,
+        lobe: float = 0.0,
+        core: float | None = None,
+    ) -> None:
+        """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
+        `tables` (cells, T), or to their rows if there are no tables.
+
+        `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
+        `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
+        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, and `core`
+        (this operator's if left out) none that are wider at the peak than peaks of twice that width
+        bear.
+        """
+        step = 1 << 13
+        light = self._light(
+            window, exact or self.resolution > 1.0, lobe, self.core if core is None else core
+        )
+        for i in range(0, len(index), step):
+            at = slice(i, min(i + step, len(index)))
+            if place is not None and not (place[at] >= 0).any():
+                continue
+            bundles, target = self._bundles(index[at], mask_rows[at]), out[at]
+            if place is not None:
+                bundles, target = bundles.of(place[at]), out
+            self._shade_all(target, bundles, light, tables)
+            report(at.stop / len(index))
+
+    def _shade_all(
+        self, out: Float32, bundles: Bundles, light: tuple[Any, ...], tables: Float32
+    ) -> None:
+        """Shade bundles, those again that have more leaves than there was room for."""
+        capacity = self._capacity
+        while len(bundles.several):
+            bundles = bundles.take(self._shade_some(out, bundles, light, tables, capacity))
+            capacity *= 2
+
+    def _shade_some(
+        self,
+        out: Float32,
+        bundles: Bundles,
+        light: tuple[Any, ...],
+        tables: Float32,
+        capacity: int,
+    ) -> NDArray[np.bool_]:
+        """Shade bundles; returns which groups have more leaves than the capacity."""
+        groups = len(bundles.several)
+        short = np.zeros(groups, np.bool_)
+        asked = np.zeros(groups, np.int64)
+        ask = np.empty((groups, _QUESTIONS, 3), np.float32)
+        answers = np.ones((groups, _QUESTIONS), np.uint8)
+        rest = (capacity, *self.grid.shape, tables)
+        shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
+            out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
+        )  # fmt: skip
+        again = (asked > 0) & ~short
+        # where rays decide, pixels do not share them
+        shared = again & (np.diff(bundles.group_start) > 1)
+        again &= ~shared
+        if shared.any():
+            apart = bundles.take(shared).separated()
+            self._shade_all(out, apart, light, tables)
+        if again.any():
+            local, which = questions(ask[again], asked[again])
+            toward = turn_about_y(local, self.scene.environment.rotation)
+            some = bundles.take(again)
+            answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
+            asker = some.sample[some.group_start[:-1]]
+            answers[which] = self.scene.visible(asker[which[0]], toward)
+            count = len(some.several)
+            shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
+                out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
+                *some.for_the_walk(), *light, *rest,
+            )  # fmt: skip
+        return short
+
+    def _add_lights(self, out: Float32, index: Int64, tables: Float32) -> None:
+        """Add the point and directional lights, each one leaf a sample."""
+        scene = self.scene
+        step = 1 << 16
+        for light in scene.lights:
+            for i in range(0, len(index), step):
+                at = slice(i, min(i + step, len(index)))
+                sample, owner, share = scene.samples(index[at])
+                toward, irradiance = scene.arriving(light, sample)
+                leaves = np.zeros((len(sample), 13, 1), np.float32)
+                local = scene.environment.to_map(toward)
+                leaves[:, :3, 0] = local
+                # the vector irradiance of a light: what faces it fully gets it fully
+                leaves[:, 3:12, 0] = (irradiance[:, :, None] * local[:, None, :]).reshape(-1, 9)
+                starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
+                one_leaf(
+                    out[at], starts, self._normals[sample], self._views[sample],
+                    share.astype(np.float32), leaves, *self.grid.shape, tables,
+                )  # fmt: skip
+
+    # -- visibility -----------------------------------------------------------------------------
+
+    def _own_rows(self, index: Int64) -> NDArray[np.int32]:
+        """(m, 4) with each fragment's own visibility row first, -1 where it has none."""
+        rows = np.full((len(index), 4), -1, np.int32)
+        if self._visibility is not None:
+            rows[:, 0] = self._visibility.row_of[index]
+        return rows
+
+    def _mask_rows(self, index: Int64) -> NDArray[np.int32]:
+        """Own rows (m, 4) of any fragments; rays are cast for those that have none yet."""
+        visibility = self._visibility
+        if visibility is None or not len(index):
+            return self._own_rows(index)
+        casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
+        unknown = np.unique(index[casts & (visibility.row_of[index] < 0)])
+        if len(unknown):
+            around = np.full((len(unknown), 4), -1, np.int32)
+            for part, plan in list(self._plans.items()):
+                span = self.scene.part_slice(part)
+                mine = (unknown >= span.start) & (unknown < span.stop)
+                around[mine] = plan.mask_rows[unknown[mine] - span.start]
+            visibility.cast(unknown, around, least=3)
+            visibility.cast_samples(unknown, self.resolution > 1.0)
+        return self._own_rows(index)
+
+    def prepare(self, part: int, progress: Progress | None = None) -> None:
+        """Cast a part's rays and find where its far images are computed, if that is not done."""
+        self._plan(part, progress)
+
+    def _plan(self, part: int, progress: Progress | None = None) -> Plan:
+        if part not in self._plans:
+            report = progress or (lambda stage, fraction: None)
+            loose = max(1.0, 1.0 / self.resolution)
+            fine = self.resolution > 1.0
+            self._plans[part] = Plan.make(self.scene, part, self._visibility, loose, fine, report)
+        return self._plans[part]
+
+
+def light_tree(environment: EnvironmentMap) -> LightTree:
+    """The tree that an `Operator` walks; build it once for several operators under one map."""
+    return LightTree.build(_divided(environment))
+
+
+def _divided(environment: EnvironmentMap) -> EnvironmentMap:
+    """The same light in texels of at most 1/256 of a half turn: each is hidden or not as a whole,
+    and small enough for series about its centre."""
+    rows, columns, _ = environment.image.shape
+    down, across = -(-256 // rows), -(-512 // columns)
+    if down == across == 1:
+        return environment
+    image = environment.image.repeat(down, axis=0).repeat(across, axis=1)
+    return EnvironmentMap(image, environment.rotation)
+
+
+def _near_window(grid: HalfDiffGrid, low: float, high: float) -> Float32:
+    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 from `low` to `high`,
+    which are nodes: so leaves of either side meet none of the other's."""
+    t = np.clip((grid.theta_h - low) / (high - low), 0.0, 1.0)
+    return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
+
+
+def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
+    """The theta_h within which tables (grid.size, T) hardly change: the width of their lobes.
+
+    Views further from the normal than `grazing` are not asked for.
+    """
+    seen = grid.theta_d <= grazing + _SPLIT[1]
+    values = tables.reshape(*grid.shape, -1)[:, seen].reshape(grid.shape[0], -1, tables.shape[1])
+    change = np.abs(values - values[0]).max(axis=1) > _FLAT * np.abs(values).max(axis=(0, 1))
+    steps = np.flatnonzero(change.any(axis=1))
+    return float(grid.theta_h[max(steps[0] - 1, 0)]) if len(steps) else 0.5 * math.pi
+
+
+def _core(grid: HalfDiffGrid, tables: Float32) -> float:
+    """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
+
+    Peaks are looked for where they are a notable share of their table's; `CORE` at most.
+    """
+    nodes = int(np.searchsorted(grid.theta_h, 2.0 * CORE)) + 1
+    values = tables.reshape(grid.shape[0], -1, tables.shape[1])[:nodes]
+    peak = values[0]
+    high = peak > 0.01 * peak.max(axis=0)
+    low = np.flatnonzero(((values < 0.5 * peak) & high).any(axis=(1, 2)))
+    if not len(low):
+        return CORE
+    return float(np.clip(0.5 * grid.theta_h[low[0]], SHARPEST, CORE))
+
+
+_NO_TABLES = np.zeros((1, 0), np.float32)
+_NO_CUT = (np.zeros(1, np.int32), np.zeros(1, np.int32))
+_NO_MASKS = tuple(np.zeros((1, 1), np.uint64) for _ in range(3))

@@ -1,0 +1,579 @@
+"""What each fragment sees of the light: cuts through the light tree, and masks.
+
+A cut is one for all fragments, chosen by the light that its nodes carry, as the global cuts of
+many-light methods are (Hasan, Pellacini & Bala, "Matrix row-column sampling for the many-light
+problem", ACM Transactions on Graphics 26(3), 2007, take rows and columns of the same matrix of
+lights by pixels); masks of neighbours are shared where they agree.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from traitbrdf.scene.lights import turn_about_y
+from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.kernels import cut_ranges, disagreement, inherit, pack_bits
+from traitbrdf.transport.lighttree import LightTree
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the fraction done; may raise to cancel."""
+
+_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
+"""How much less a part may bend than `_BEND` for far images to begin nearer."""
+
+_KEPT = 0.9
+"""Share of the fragments with interpolated far images that must remain so at such a scale."""
+
+_LEVELS = (4, 2)
+"""Spacing in pixels of the lattices on which far images are computed."""
+
+_BEND = (0.003, 0.06)
+"""Most that a half vector departs, seen against the normal, from those of its cell's corners:
+from their mean, and from any."""
+
+_UNEVEN = 0.005
+"""Most that a cell's corners differ in what light they see: see `disagreement`."""
+
+
+@dataclass(frozen=True)
+class VisibilityCut:
+    """Nodes of a light tree whose visibility is one bit each.
+
+    Attributes
+    ----------
+    first, last : (n,) int32
+        The cut nodes under (or above) every node of the tree are `first` to `last - 1`.
+    directions : (D, 3) float64, towards the light, in the map's frame
+    share : (D,) float64, of all flux
+    neighbours : (D, 6) int32, the nearest other directions
+    """
+
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    directions: Float64
+    share: Float64
+    neighbours: NDArray[np.int32]
+
+    @classmethod
+    def build(cls, tree: LightTree, spacing: float, share: float) -> VisibilityCut:
+        """Cut where nodes are no wider than `spacing` and hold no more than `share` of the flux."""
+        flux = tree.flux
+        whole = (tree.child < 0).all(axis=1)
+        total = max(float(flux[whole].sum()), 1e-300)
+        split = ~whole & ((tree.radius > spacing) | (flux > share * total))
+        first, last, cut = cut_ranges(tree.child, split)
+        directions = tree.direction[cut].astype(np.float64)
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        near = min(7, len(cut))
+        _, nearest = cKDTree(directions).query(directions, k=near)
+        neighbours = np.repeat(np.arange(len(cut), dtype=np.int32)[:, None], 6, axis=1)
+        neighbours[:, : near - 1] = np.asarray(nearest).reshape(len(cut), near)[:, 1:]
+        return cls(first, last, directions, flux[cut] / total, neighbours)
+
+
+@dataclass(frozen=True)
+class Bundles:
+    """Samples in groups that share one walk, and groups in bundles that one thread shades.
+
+    `target` says which fragment a sample belongs to: all its samples are in one bundle.
+    """
+
+    bundle_start: Int64  # (B + 1,) into groups
+    group_start: Int64  # (G + 1,) into samples
+    target: Int64  # (n,)
+    normals: Float32  # (n, 3)
+    views: Float32  # (n, 3)
+    share: Float32  # (n,)
+    sample: Int64  # (n,) in the scene
+    middle_normals: Float32  # (G, 3)
+    middle_views: Float32  # (G, 3)
+    spread: Float32  # (G,) how far half vectors against the normals differ within the group
+    masks: NDArray[np.int32]  # (G, 4)
+    several: NDArray[np.bool_]  # (G,) whether the fragment has other groups
+
+    _PER_SAMPLE: ClassVar = ("normals", "views", "share", "sample")
+
+    def for_the_walk(self) -> tuple[Any, ...]:
+        return (
+            self.bundle_start, self.group_start, self.target, self.normals, self.views, self.share,
+            self.middle_normals, self.middle_views, self.spread, self.masks, self.several,
+        )  # fmt: skip
+
+    def of(self, place: Int64) -> Bundles:
+        """The samples of some fragments alone, in their groups; `place` renumbers the fragments,
+        and those of -1 are left out."""
+        target = place[self.target]
+        left = np.concatenate([[0], np.cumsum(target >= 0)])[self.group_start]
+        kept = replace(
+            self, group_start=left, target=target[target >= 0],
+            **{name: getattr(self, name)[target >= 0] for name in self._PER_SAMPLE},
+        )  # fmt: skip
+        return kept.take(np.diff(left) > 0)
+
+    def separated(self) -> Bundles:
+        """Each sample in a group of its own."""
+        size = np.diff(self.group_start)
+        starts = np.arange(len(self.target) + 1)
+        return replace(
+            self, bundle_start=self.group_start[self.bundle_start], group_start=starts,
+            middle_normals=self.normals, middle_views=self.views,
+            spread=np.zeros(len(self.target), np.float32),
+            masks=np.repeat(self.masks, size, axis=0), several=np.repeat(self.several, size),
+        )  # fmt: skip
+
+    def take(self, groups: NDArray[np.bool_]) -> Bundles:
+        """These groups alone."""
+        kept = np.flatnonzero(groups)
+        samples, group_start = expand(self.group_start, kept)
+        bundle = np.repeat(np.arange(len(self.bundle_start) - 1), np.diff(self.bundle_start))[kept]
+        bundle_start = np.append(np.flatnonzero(np.diff(bundle, prepend=-1)), len(kept))
+        return Bundles(
+            bundle_start, group_start, self.target[samples], self.normals[samples],
+            self.views[samples], self.share[samples], self.sample[samples],
+            self.middle_normals[kept], self.middle_views[kept], self.spread[kept],
+            self.masks[kept], self.several[kept],
+        )  # fmt: skip
+
+
+def expand(starts: Int64, chosen: Int64) -> tuple[Int64, Int64]:
+    """Members of the `chosen` sets of a list in sets, and where the new sets start."""
+    size = np.diff(starts)[chosen]
+    new = np.concatenate([[0], np.cumsum(size)])
+    members = np.arange(new[-1]) - np.repeat(new[:-1] - starts[chosen], size)
+    return members, new
+
+
+def alike_masks(
+    edge: Int64,
+    size: Int64,
+    normals: Float32,
+    views: Float32,
+    positions: Float64,
+    masks: NDArray[np.int32],
+    limit: float,
+) -> NDArray[np.bool_]:
+    """Whether the members of each set see the light nearly alike and share their masks."""
+    whose = np.repeat(np.arange(len(edge)), size)
+
+    def away(values: NDArray[Any]) -> tuple[Float64, Float64]:
+        mean = np.add.reduceat(values.astype(np.float64), edge, axis=0) / size[:, None]
+        off = values - mean[whose]
+        return off, np.linalg.norm(off, axis=-1)
+
+    _, turned = away(normals)
+    _, moved = away(views)
+    apart, distance = away(positions)
+    # on one sheet of the surface
+    lifted = np.abs(np.einsum("nk,nk->n", apart, normals)) > 0.3 * distance + 1e-9
+    good = (turned + 0.5 * moved <= limit) & ~lifted
+    masked = masks[:, 0] >= 0
+    highest = np.maximum.reduceat(masks, edge, axis=0)[whose]
+    good &= ~masked | (masks == highest).all(axis=1)
+    answer: NDArray[np.bool_] = np.logical_and.reduceat(good, edge)
+    return answer
+
+
+def centres(
+    group_start: Int64, normals: Float32, views: Float32
+) -> tuple[Float32, Float32, Float32]:
+    """Mean unit normals and views of groups, and how far their members' half vectors depart."""
+    size = np.diff(group_start)
+    means = []
+    off = np.zeros(len(normals))
+    for values, weight in ((normals, 1.0), (views, 0.5)):
+        mean = np.add.reduceat(values.astype(np.float64), group_start[:-1], axis=0)
+        mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-12)
+        off += weight * np.linalg.norm(values - np.repeat(mean, size, axis=0), axis=-1)
+        means.append(mean.astype(np.float32))
+    spread = np.maximum.reduceat(off, group_start[:-1])
+    spread[size == 1] = 0.0
+    return means[0], means[1], spread.astype(np.float32)
+
+
+def first_rows(group_start: Int64, masks: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The mask rows of each group: those of any member that has some."""
+    rows: NDArray[np.int32] = np.maximum.reduceat(masks, group_start[:-1], axis=0)
+    return rows
+
+
+def questions(ask: Float32, asked: Int64) -> tuple[Float64, tuple[Int64, Int64]]:
+    """Unit directions of all questions, and (sample, question) of each."""
+    sample, question = np.nonzero(np.arange(ask.shape[1]) < asked[:, None])
+    toward = ask[sample, question].astype(np.float64)
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    return toward, (sample.astype(np.int64), question.astype(np.int64))
+
+
+class Visibility:
+    """One bit for every node of the cut, at the fragments where rays were cast."""
+
+    def __init__(self, scene: Scene, cut: VisibilityCut, middle: Int64) -> None:
+        self.scene = scene
+        self.cut = cut
+        self.toward = turn_about_y(cut.directions, scene.environment.rotation)
+        self.row_of = np.full(len(scene.pixels), -1, np.int32)
+        # of samples with rays of their own: a fragment at a border lies on either side of an edge
+        self.row_of_sample = np.full(len(scene.normals), -1, np.int32)
+        self.rows = 0
+        self._sharp = cut.share > 0.02  # suns, that cast sharp shadows
+        self._lock = threading.Lock()  # one thread casts for the next part while another shades
+        self._middle = middle
+        self._bits = np.zeros((0, len(cut.share)), np.uint8)
+        words = (len(cut.share) + 63) // 64
+        self._masks = tuple(np.zeros((0, words), np.uint64) for _ in range(3))
+
+    @property
+    def bits(self) -> NDArray[np.uint8]:
+        """(rows, D): 0 hidden, 1 visible, 2 below the horizon."""
+        return self._bits[: self.rows]
+
+    @property
+    def masks(self) -> tuple[NDArray[np.uint64], ...]:
+        """Sets (rows, words) of nodes, 64 a word, that are: hidden; not surely visible; not
+        surely hidden. Sure is a node whose neighbours on the sphere agree with it."""
+        return self._masks
+
+    def cast(
+        self, index: Int64, around: NDArray[np.int32], least: int, verify: bool = False
+    ) -> None:
+        """Find the bits of fragments `index` (m,), with rays where the `around` (m, 4) disagree.
+
+        Fewer than `least` rows around, and every node above the horizon gets a ray. `verify` casts
+        an eighth of what they agree on, and all of it where that proves them wrong.
+        """
+        normals = self.scene.normals[self._middle[index]]
+        for i in range(0, len(index), 2048):
+            some = slice(i, min(i + 2048, len(index)))
+            bits = np.empty((some.stop - some.start, len(self.cut.share)), np.uint8)
+            inherit(bits, normals[some], self.toward, self._bits, around[some], least, self._sharp)
+            if verify:
+                inherited = bits[:, ::8].copy()
+                bits[:, ::8][inherited < 2] = 3
+                self._ray(bits, self._middle[index[some]])
+                wrong = ((inherited != bits[:, ::8]) & (inherited < 2)).any(axis=1)
+                bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
+            self._ray(bits, self._middle[index[some]])
+            with self._lock:
+                self.row_of[index[some]] = self._append(bits)
+
+    def cast_samples(self, index: Int64, fine: bool) -> None:
+        """Bits of every sample of those of the fragments `index` that have several.
+
+        The first and the last get rays; where these and the middle one agree, so do the others,
+        unless all shall have them (`fine`).
+        """
+        offsets = self.scene.offsets
+        count = np.diff(offsets)[index]
+        index = index[(count > 1) & (self.row_of[index] >= 0)]
+        known = self.row_of_sample[offsets[index]] >= 0
+        index = index[~known]
+        self.row_of_sample[self._middle[index]] = self.row_of[index]
+        ends = np.stack([offsets[index], offsets[index + 1] - 1], axis=1)
+        nothing = np.full((len(ends), 4), -1, np.int32)
+        for side in (0, 1):
+            self._cast_samples(ends[:, side], nothing)
+        around = nothing
+        if not fine:
+            around[:, 0] = self.row_of[index]
+            around[:, 1:3] = self.row_of_sample[ends]
+        samples, starts = expand(offsets, index)
+        self._cast_samples(samples, np.repeat(around, np.diff(starts), axis=0))
+
+    def _cast_samples(self, samples: Int64, around: NDArray[np.int32]) -> None:
+        """Bits of those samples that have none, with rays where the rows `around` disagree."""
+        new = self.row_of_sample[samples] < 0
+        samples, around = samples[new], around[new]
+        for i in range(0, len(samples), 2048):
+            chosen = samples[i : i + 2048]
+            bits = np.empty((len(chosen), len(self.cut.share)), np.uint8)
+            inherit(
+                bits, self.scene.normals[chosen], self.toward, self._bits,
+                around[i : i + 2048], 3, self._sharp,
+            )  # fmt: skip
+            self._ray(bits, chosen)
+            with self._lock:
+                self.row_of_sample[chosen] = self._append(bits)
+
+    def _append(self, bits: NDArray[np.uint8]) -> Int64:
+        """Keep rows of bits; returns their numbers."""
+        need = self.rows + len(bits)
+        if need > len(self._bits):
+            size = max(need, len(self._bits) * 5 // 4)
+            self._bits = _grown(self._bits, size)
+            self._masks = tuple(_grown(a, size) for a in self._masks)
+        rows = slice(self.rows, need)
+        self._bits[rows] = bits
+        pack_bits(bits, self.cut.neighbours, *(a[rows] for a in self._masks))
+        self.rows = need
+        return np.arange(rows.start, rows.stop)
+
+    def _ray(self, bits: NDArray[np.uint8], sample: Int64) -> None:
+        """Fill the bits that are 3 by rays from the samples (m,)."""
+        at, node = np.nonzero(bits == 3)
+        bits[at, node] = self.scene.visible(sample[at], self.toward[node])
+
+
+def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
+    larger = np.zeros((size, array.shape[1]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where a part's far images are computed, and how the others follow; indices in the part.
+
+    Attributes
+    ----------
+    computed : (K,) fragments whose far images are computed
+    corners : (P, 4) int32 indices into `computed`
+    weights : (P, 4) float32
+    mask_rows : (P, 4) int32 visibility rows around each fragment, -1 for none
+    scale : of `_SPLIT` and `_BEND`
+    grazing : the largest angle of a view from its normal, in radians
+    """
+
+    computed: Int64
+    corners: NDArray[np.int32]
+    weights: Float32
+    mask_rows: NDArray[np.int32]
+    scale: float
+    grazing: float
+
+    @classmethod
+    def make(
+        cls,
+        scene: Scene,
+        part: int,
+        visibility: Visibility | None,
+        loose: float,
+        fine: bool,
+        report: Progress,
+    ) -> Plan:
+        span = scene.part_slice(part)
+        count = span.stop - span.start
+        casts = visibility if scene.casts[part] else None
+        pixels = scene.pixels[span]
+        x, y = pixels % scene.width, pixels // scene.width
+        single = ~scene.bordering[span]
+        middle = scene.offsets[:-1][span] + np.diff(scene.offsets)[span] // 2
+        positions, normals = scene.positions[middle], scene.normals[middle]
+        views = scene.views[middle]
+        lattice = _Lattice(scene.height, scene.width, x, y, single, positions, normals)
+        everything = np.arange(count)
+        known = np.zeros(count, bool)  # has a visibility row
+        nothing = np.full((count, 4), -1, np.int64)
+
+        def look(some: Int64, around: Int64, least: int = 3, verify: bool = False) -> None:
+            new = ~known[some]
+            some, around = some[new], around[new]
+            if casts is not None and len(some):
+                rows = np.where(around >= 0, casts.row_of[span][around], -1).astype(np.int32)
+                casts.cast(some + span.start, rows, least, verify and loose == 1.0)
+            known[some] = True
+
+        if casts is not None:
+            coarse = 16
+            on = lattice.on(coarse)
+            look(on, nothing[on])
+            while coarse > _LEVELS[0]:
+                around, _ = lattice.cell(everything, coarse)
+                coarse //= 2
+                on = lattice.on(coarse)
+                look(on, around[on], verify=True)
+                report("shadows", 0.0)
+        sharp = _sharp_bits(scene, span, casts)
+        corners = np.repeat(everything[:, None], 4, axis=1)
+        weights = np.zeros((count, 4))
+        weights[:, 0] = 1.0
+        around = nothing.copy()
+        open_ = everything[single]
+        # half vectors move against the normal with either of them
+        bend = np.concatenate([normals, 0.5 * views], axis=1)
+        found, weight = lattice.cell(open_, _LEVELS[0])
+        off, spread = _departure(bend, open_, found, weight)
+        off, spread = (np.where((weight != 0.0).any(axis=1), d, np.inf) for d in (off, spread))
+        fits = [np.count_nonzero(_predictable(off, spread, loose * s)) for s in (*_SCALES, 1.0)]
+        good = [s for s, n in zip(_SCALES, fits, strict=False) if n >= max(_KEPT * fits[-1], 1)]
+        scale = good[0] if good else 1.0
+        for level in _LEVELS:
+            on = lattice.on(level)
+            if level != _LEVELS[0]:
+                # only the corners of cells that are still open
+                wanted, _ = lattice.cell(open_, level)
+                on = np.unique(wanted[wanted >= 0])
+                look(on, around[on], 2, verify=True)
+            found, weight = lattice.cell(open_, level)
+            ok = (weight != 0.0).any(axis=1)
+            ok &= _predictable(*_departure(bend, open_, found, weight), loose * scale)
+            if casts is not None:
+                ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
+            good = open_[ok]
+            # a missing corner weighs nothing: any other stands for it
+            some = np.take_along_axis(found, (found >= 0).argmax(axis=1)[:, None], axis=1)
+            corners[good] = np.where(found >= 0, found, some)[ok]
+            weights[good] = weight[ok]
+            around[open_] = np.where((found >= 0).sum(1)[:, None] >= 2, found, around[open_])
+            open_ = open_[~ok]
+        border = everything[~single]
+        around[border], _ = lattice.cell(border, _LEVELS[0])
+        alone = np.concatenate([open_, border])
+        look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
+        if casts is not None:
+            for some in np.array_split(border, len(border) // 1024 + 1):
+                casts.cast_samples(some + span.start, fine)
+                report("shadows", 1.0)
+        report("shadows", 1.0)
+        corners[alone] = alone[:, None]
+        weights[alone] = (1.0, 0.0, 0.0, 0.0)
+        computed, index = np.unique(corners, return_inverse=True)
+        mask_rows = np.full((count, 4), -1, np.int32)
+        if casts is not None:
+            rows = casts.row_of[span]
+            mask_rows = rows[corners].astype(np.int32)
+            mask_rows[alone, 1:] = -1
+            free = (casts.bits[:, :] == 0).sum(axis=1) == 0
+            # where nothing hides anything around, there is nothing to look up
+            clear = np.where(mask_rows >= 0, free[mask_rows], True).all(axis=1) & single
+            mask_rows[clear] = -1
+            mask_rows = -np.sort(-mask_rows, axis=1)  # the walk reads up to the first -1
+        return cls(
+            computed, index.reshape(corners.shape).astype(np.int32),
+            weights.astype(np.float32), mask_rows, scale,
+            math.acos(np.einsum("mc,mc->m", normals, views).clip(0.0, 1.0).min(initial=1.0)),
+        )  # fmt: skip
+
+
+class _Lattice:
+    """Fragments of one part by pixel, and the cells of square lattices around them."""
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        x: Int64,
+        y: Int64,
+        single: NDArray[np.bool_],
+        positions: Float64,
+        normals: Float64,
+    ) -> None:
+        self._x, self._y, self._single = x, y, single
+        self._positions, self._normals = positions, normals
+        # a margin on the far sides spares the tests at the frame's edge
+        margin = 32
+        self._at = np.full((height + margin, width + margin), -1, np.int64)
+        inside = np.flatnonzero(single)
+        self._at[y[inside], x[inside]] = inside
+
+    def on(self, spacing: int) -> Int64:
+        """Fragments that are points of the lattice."""
+        mask = self._single & (self._x % spacing == 0) & (self._y % spacing == 0)
+        return np.flatnonzero(mask)
+
+    def cell(self, some: Int64, spacing: int) -> tuple[Int64, Float64]:
+        """Corners (m, 4) of the cells of fragments `some`, -1 where missing, and their weights.
+
+        Bilinear; a plane through three where one is missing; zero where more are.
+        """
+        x0, y0 = self._x[some] // spacing * spacing, self._y[some] // spacing * spacing
+        u = (self._x[some] - x0) / spacing
+        v = (self._y[some] - y0) / spacing
+        step = ((0, 0), (0, spacing), (spacing, 0), (spacing, spacing))
+        corners = np.stack([self._at[y0 + dy, x0 + dx] for dy, dx in step], axis=1)
+        weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1)
+        # a corner on another sheet of the surface, before or behind, is no neighbour
+        apart = self._positions[corners] - self._positions[some, None]
+        off = np.abs(np.einsum("mkc,mc->mk", apart, self._normals[some]))
+        corners[off > 0.25 * np.linalg.norm(apart, axis=-1)] = -1
+        missing = corners < 0
+        lacking = missing.sum(axis=1)
+        # a corner is its two neighbours less the opposite one
+        for k, (a, b, c) in enumerate(((1, 2, 3), (0, 3, 2), (0, 3, 1), (1, 2, 0))):
+            gone = missing[:, k] & (lacking == 1)
+            w = weights[gone, k]
+            weights[gone, a] += w
+            weights[gone, b] += w
+            weights[gone, c] -= w
+            weights[gone, k] = 0.0
+        needed = (missing & (weights > 0.0)).any(axis=1)
+        weights[(lacking > 1) & needed] = 0.0
+        weights[missing] = 0.0
+        return corners, weights
+
+
+def _departure(
+    bend: Float64, some: Int64, corners: Int64, weights: Float64
+) -> tuple[Float64, Float64]:
+    """How far `bend` of fragments `some` (m,) is from their cells' corners: from the mean, and from
+    any."""
+    at = np.where(corners >= 0, corners, some[:, None])
+    around, own = bend[at], bend[some]
+    off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
+    return off, np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
+
+
+def _predictable(off: Float64, spread: Float64, loose: float) -> NDArray[np.bool_]:
+    """Whether half vectors vary so linearly over a cell that images of wide lobes do."""
+    answer: NDArray[np.bool_] = (off < loose * _BEND[0]) & (spread < loose * _BEND[1])
+    return answer
+
+
+def _sharp_bits(
+    scene: Scene, span: slice, visibility: Visibility | None
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
+    """Cut nodes that outshine all others, and whether each fragment sees them, a ray for each."""
+    if visibility is None:
+        return None
+    nodes = np.argsort(-visibility.cut.share)[:4]
+    nodes = nodes[visibility.cut.share[nodes] > 0.03]
+    if not len(nodes):
+        return None
+    sample = scene.offsets[:-1][span] + np.diff(scene.offsets)[span] // 2
+    bits = np.zeros((len(sample), len(nodes)), bool)
+    for k, node in enumerate(nodes):
+        toward = visibility.toward[node]
+        up = np.flatnonzero(scene.normals[sample] @ toward > 0.0)
+        bits[up, k] = scene.visible(sample[up], np.broadcast_to(toward, (len(up), 3)))
+    return nodes, bits
+
+
+def _shadows_agree(
+    visibility: Visibility,
+    span: slice,
+    normals: Float64,
+    some: Int64,
+    corners: Int64,
+    sharp: tuple[NDArray[np.int64], NDArray[np.bool_]] | None,
+    loose: float,
+) -> NDArray[np.bool_]:
+    """Whether the corners of a fragment's cell are lit alike."""
+    rows = np.where(corners >= 0, visibility.row_of[span][corners], -1).astype(np.int32)
+    cells, which = np.unique(rows, axis=0, return_inverse=True)
+    first = np.zeros(len(cells), np.int64)
+    first[which.reshape(-1)[::-1]] = np.arange(len(which))[::-1]
+    unlike = np.empty(len(cells), np.float32)
+    disagreement(
+        unlike, visibility.bits, cells, normals[some[first]],
+        visibility.toward, visibility.cut.share,
+    )  # fmt: skip
+    agree: NDArray[np.bool_] = (unlike < loose**1.5 * _UNEVEN)[which.reshape(-1)]
+    if sharp is not None:
+        nodes, own = sharp
+        for k, node in enumerate(nodes):
+            bit = np.append(visibility.bits[:, node], np.uint8(2))  # row -1: nothing is known
+            # a corner below the light's horizon says nothing about its shadow
+            same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
+            agree &= same.all(axis=1)
+    return agree
