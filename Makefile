@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: venv peers browser demo test lint types unit live notebooks bench library clean
+.PHONY: venv peers browser demo test test-slow lint types unit live notebooks bench library clean
 
 venv: $(STAMP)
 
@@ -33,7 +33,7 @@ browser: venv
 demo: venv
 	$(BIN)/traitbrdf demo --out out/demo
 
-test: lint types browser unit
+test: lint types unit
 
 lint: venv
 	$(BIN)/ruff check .
@@ -42,8 +42,13 @@ lint: venv
 types: venv
 	$(BIN)/mypy
 
+# Two processes of one thread each: they take two thirds of the time of one with two threads.
 unit: venv
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+# Whatever takes more than a few seconds: real browsers, whole benches, a rebuild of the artifact.
+test-slow: browser
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 bench: venv
 	$(BIN)/traitbrdf bench
