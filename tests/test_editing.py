@@ -57,6 +57,12 @@ def small_training(training, monkeypatch):
     monkeypatch.setattr(preparation, "training_of", lambda library, seed: training)
 
 
+@pytest.fixture
+def types_take_as_long(monkeypatch):
+    """Which number type is faster is measured: on a busy machine it comes out either way."""
+    monkeypatch.setattr(promises, "_median_seconds", lambda *_: 1e-3)
+
+
 @pytest.fixture(scope="module")
 def prepared(small_teapot, training):
     with pytest.MonkeyPatch.context() as patch:
@@ -412,7 +418,7 @@ def test_the_history_replays_to_the_identical_frame(edit, fresh):
 # -- files ------------------------------------------------------------------------------------
 
 
-def test_a_teapot_design_survives_its_file(edit, fresh, tmp_path, shared_data):
+def test_a_teapot_design_survives_its_file(types_take_as_long, edit, fresh, tmp_path, shared_data):
     # as few basis images as its error needs, as the loaded one will have
     known = edit._view.prepared
     edit._view.prepared = promised(known, edit.library, edit.settings)
@@ -541,9 +547,7 @@ def test_angles_that_a_scene_shows(part):
     assert picture.shape[2] == 3
 
 
-def test_a_sphere_design_survives_its_file(tmp_path, monkeypatch):
-    # which number type is faster is measured: on a busy machine it comes out either way
-    monkeypatch.setattr(promises, "_median_seconds", lambda *_: 1e-3)
+def test_a_sphere_design_survives_its_file(types_take_as_long, tmp_path):
     camera = tb.Camera.orbit(10.0, 80.0, fov=50.0, zoom=0.7, target=(0.1, 2.0, 3.0))
     light = tb.DirectionalLight((0.3, 0.2, 0.7))
     sky = tb.EnvironmentMap.sky(rows=16).rotated(-1.0)
