@@ -39,6 +39,7 @@ from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap, Light
 from traitbrdf.scene.scene import Scene
+from traitbrdf.session.budget import quality_for
 from traitbrdf.session.cache import Cache
 from traitbrdf.session.frames import (
     Drafted,
@@ -87,6 +88,7 @@ class EditSession:
     ----------
     scene : Scene
     quality, **asked : what is asked for: error, fps, device, seed, cache; see `Settings`
+        A quality of None is what `error` needs, "interactive" without one.
     library, traits : what to edit with; None is what the package ships
     progress : called with (stage, fraction) while the scene is prepared, from the thread that
         prepares; may raise to cancel
@@ -118,6 +120,7 @@ class EditSession:
     ) -> None:
         if not isinstance(scene, Scene):
             raise TypeError(f"scene: expected a Scene, got {scene!r}")
+        quality = quality_for(asked.get("error")) if quality is None else quality
         self.settings = Settings(quality, **asked)
         self.library = default_library() if library is None else library
         self.embedding = self.library.embedding
@@ -138,13 +141,12 @@ class EditSession:
         self._reached: dict[str, Move] = {}
 
     def __repr__(self) -> str:
-        quality = self.settings.quality
-        return f"EditSession({self.scene!r}, quality={quality!r}, {len(self._done)} edits)"
+        return f"EditSession({self.scene!r}, quality={self.quality!r}, {len(self._done)} edits)"
 
     @property
     def quality(self) -> str:
         """Of `settings`."""
-        return self.settings.tier
+        return self.settings.quality
 
     @property
     def error(self) -> float | None:
@@ -776,11 +778,11 @@ class EditSession:
         self._edited.add(part)
         with self._prepared() as (_, transport):
             table = self.embedding.decode_tensor(z, material.offset, transport.cells)
-            shown = transport.radiance(index, table.to(self.settings.place, torch.float32))
+            shown = transport.radiance(index, table.to(self.device, torch.float32))
             known = transport.parts[index]
             if known is None or not material.mirror.any():
                 return shown
-            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
             return shown + mirror * known.mirror
 
     def gradient(self, part: str) -> tuple[Int64, Float32]:
@@ -798,7 +800,7 @@ class EditSession:
         self._edited.add(part)
         with self._prepared() as (view, transport):
             slopes = self.embedding.jacobian(material.z, material.offset, transport.cells)
-            columns = torch.from_numpy(slopes).to(self.settings.place).permute(2, 0, 1)
+            columns = torch.from_numpy(slopes).to(self.device).permute(2, 0, 1)
             # radiance is linear in the table: all coordinates in one product
             moved = torch.vmap(lambda table: transport.radiance(index, table))(columns)
             pixels = view.scene.pixels[view.scene.part_slice(index)].copy()
@@ -836,9 +838,9 @@ class EditSession:
             if fresh:
                 self._frame(view, transport)
             return {
-                "quality": self.settings.quality,
-                "error_asked": EXACT_ABOVE if self.settings.error is None else self.settings.error,
-                **view_report(view, transport, materials, self.embedding, self.settings.place),
+                "quality": self.quality,
+                "error_asked": EXACT_ABOVE if self.error is None else self.error,
+                **view_report(view, transport, materials, self.embedding, self.device),
                 "parts": {
                     part: {
                         **part_report(material, view.shown[i], self.traits),
@@ -871,11 +873,9 @@ class EditSession:
         where the basis was trained meanwhile. What was undone is not kept.
         """
         with self._lock:
-            materials = dict(self._materials)
+            scene, materials = self.scene, dict(self._materials)
             said = [*self._replayed, *(edit.said for edit in self._done)]
-            write_design(
-                path, self.scene, materials, said, self.settings, self.traits, self.embedding
-            )
+        write_design(path, scene, materials, said, self.settings, self.traits, self.embedding)
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> EditSession:

@@ -267,7 +267,7 @@ def prepare_view(
     report("compiling", 0.0)
     traits.reach(library.coordinates[0], {traits.names[0]: 0.1})  # else the first stroke waits
     prepared = _transport(scene, settings, library, cache, fixed, known, report)
-    if settings.tier == "reference" or (settings.error is None and settings.fps is None):
+    if settings.quality == "reference" or (settings.error is None and settings.fps is None):
         return prepared
     report("measuring", 1.0)
     return promised(prepared, library, settings)
@@ -307,7 +307,7 @@ def promised(prepared: Prepared, library: Library, settings: Settings) -> Prepar
     borne = np.array([trusted_error(scene, i, 1.0) for i in range(len(scene.parts))])
     dimensions = len(some[0])
     transport, promise = keep(
-        whole, stacked, borne, frame, settings.tier, dimensions, settings.error, settings.fps
+        whole, stacked, borne, frame, settings.quality, dimensions, settings.error, settings.fps
     )
     return replace(prepared, transport=transport, promise=promise)
 
@@ -322,7 +322,7 @@ def _transport(
     report: Progress,
 ) -> Prepared:
     """The transport of a scene with all images of a quality, computed or read."""
-    rank, resolution = QUALITIES[settings.tier]
+    rank, resolution = QUALITIES[settings.quality]
     seed, device = settings.seed, settings.place
     grid = library.embedding.grid_
     tables = {part: material.values(library.embedding) for part, material in fixed.items()}

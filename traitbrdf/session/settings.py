@@ -9,7 +9,7 @@ from typing import TypedDict
 import torch
 
 from traitbrdf.formats.files import unknown_name
-from traitbrdf.session.budget import QUALITIES, quality_for
+from traitbrdf.session.budget import QUALITIES
 
 
 class Asked(TypedDict, total=False):
@@ -28,9 +28,8 @@ class Settings:
 
     Parameters
     ----------
-    quality : "preview", "interactive", "accurate", "reference" or None
-        None becomes what `error` needs, "interactive" without one. "reference" shows exact frames
-        alone, which take seconds.
+    quality : "preview", "interactive", "accurate" or "reference"
+        "reference" shows exact frames alone, which take seconds.
     error : float or None
         The mean relative L1 that every shown part has to meet by its own measurement (a part
         smaller than a tenth of the shape up to three times as much); parts that do not are
@@ -53,7 +52,7 @@ class Settings:
         On an unknown quality, an error or a speed that is no positive number, or both of them.
     """
 
-    quality: str | None = None
+    quality: str = "interactive"
     error: float | None = None
     fps: float | None = None
     device: str | torch.device = "cpu"
@@ -68,16 +67,9 @@ class Settings:
             raise ValueError(
                 f"expected error or fps, got both: error={self.error!r}, fps={self.fps!r}"
             )
-        quality = quality_for(self.error) if self.quality is None else self.quality
-        if quality not in QUALITIES:
-            raise ValueError(unknown_name("quality", quality, tuple(QUALITIES)))
-        object.__setattr__(self, "quality", quality)
-        object.__setattr__(self, "device", torch.device(self.device))
-
-    @property
-    def tier(self) -> str:
-        """The quality, once it is known."""
-        return str(self.quality)
+        if self.quality not in QUALITIES:
+            raise ValueError(unknown_name("quality", self.quality, tuple(QUALITIES)))
+        torch.device(self.device)  # an unknown one is told of now
 
     @property
     def place(self) -> torch.device:

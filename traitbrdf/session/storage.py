@@ -144,9 +144,9 @@ class Stored:
                     path, f"a design of format 1 to {_FORMAT}", f"{header['format']!r}"
                 )
             scene = _saved_scene(header, arrays)
-            settings = {name: header[name] for name in ("quality", "error", "seed")}
-            settings["fps"] = header.get("fps")
-            Settings(**settings)
+            header = {"fps": None, **header}  # which older files do not have
+            settings = {name: header[name] for name in _KEPT}
+            Settings(**settings)  # what is wrong in the file is no mistake of the caller
             said = [
                 Said(str(call), str(anywhere), framing_of(scene))
                 for call, anywhere in zip(header["history"], header["anywhere"], strict=True)

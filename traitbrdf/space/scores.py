@@ -506,8 +506,9 @@ class Around(NamedTuple):
     steep: Float64
 
 
-def unlikely(log: float) -> float:
-    """How unlikely a point is of which the log density is known, on the scale of `Around.walls`."""
+def unlikely(log: Any) -> Any:
+    """How unlikely a point is of which the log density, or its slope, is known, on the scale of
+    `Around.walls`."""
     return -THIN * log
 
 
@@ -596,7 +597,7 @@ class Ground(NamedTuple):
         if self.density is not None:
             likely, uphill = self.density.slope(point)
             walls[2] = unlikely(likely)
-            np.multiply(uphill, -THIN, out=steep[2])
+            steep[2] = unlikely(uphill)
         if self.cells is None:
             score = self.normals @ point - self.zero
             return Around(score, self.normals, lab, colours, walls, steep)

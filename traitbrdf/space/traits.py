@@ -448,9 +448,9 @@ class TraitSpace:
         --------
         >>> from traitbrdf import default_library, default_traits
         >>> library, space = default_library(), default_traits()
-        >>> z = library.coordinates[library.index("blue-plastic")]
+        >>> z = library.coordinates[library.index("oak-varnished")]
         >>> shinier = space.move(z, {"shiny": 0.5})
-        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 2)
+        >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 3)
         0.5
 
         Raises
