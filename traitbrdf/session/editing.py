@@ -51,7 +51,6 @@ from traitbrdf.session.frames import (
     measured,
     move_call,
 )
-from traitbrdf.session.materials import Material
 from traitbrdf.session.preparation import (
     DRAFT_SIZE,
     EXACT_ABOVE,
@@ -67,7 +66,8 @@ from traitbrdf.session.settings import Asked, Settings
 from traitbrdf.session.storage import Stored, write_design
 from traitbrdf.space.learning import Trait
 from traitbrdf.space.library import Library, default_library
-from traitbrdf.space.moves import Move
+from traitbrdf.space.material import Material
+from traitbrdf.space.moves import Moved
 from traitbrdf.space.traits import TraitSpace, default_traits
 from traitbrdf.transport.angles import AnglesSeen, angles_seen
 from traitbrdf.transport.drafts import Draft
@@ -138,7 +138,7 @@ class EditSession:
         self._done: list[Edit] = []
         self._undone: list[Edit] = []
         self._replayed: list[Said] = []
-        self._reached: dict[str, Move] = {}
+        self._reached: dict[str, Moved] = {}
 
     def __repr__(self) -> str:
         return f"EditSession({self.scene!r}, quality={self.quality!r}, {len(self._done)} edits)"
@@ -303,13 +303,13 @@ class EditSession:
         amounts: Mapping[str, float],
         hold: Iterable[str] | None,
         photoreal: bool = True,
-    ) -> tuple[Material, Move]:
+    ) -> tuple[Material, Moved]:
         found = self.traits.moved(old.z, amounts, hold, photoreal)
         if np.array_equal(found.z, old.z):
             return old, found
         return replace(old, z=found.z, table=None), found
 
-    def reached(self, part: str) -> Move | None:
+    def reached(self, part: str) -> Moved | None:
         """What the last move or stroke came to on a part, while it is the last edit; else None."""
         self.part(part)
         return self._reached.get(part)
@@ -380,7 +380,7 @@ class EditSession:
         return moved
 
     def _do(
-        self, new: dict[str, Material], said: Said, reached: dict[str, Move] | None = None
+        self, new: dict[str, Material], said: Said, reached: dict[str, Moved] | None = None
     ) -> None:
         with self._lock:
             before = {part: self._materials[part] for part in new}

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.canvas import Canvas
-from traitbrdf.session.materials import Material
 from traitbrdf.session.preparation import Preparation, Prepared
+from traitbrdf.space.material import Material
 from traitbrdf.transport.drafts import Draft
 from traitbrdf.transport.transport import PartFrame, Transport
 

@@ -22,9 +22,9 @@ from traitbrdf.scene.scene import Scene
 from traitbrdf.session.budget import QUALITIES, TRUSTED, Promise, keep
 from traitbrdf.session.cache import Cache, cache_key, fixed_key
 from traitbrdf.session.canvas import Canvas
-from traitbrdf.session.materials import Material
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.library import Library
+from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.basis import Training, training_tables
 from traitbrdf.transport.lighttree import LightTree

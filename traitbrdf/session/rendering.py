@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.frames import Shown, View
-from traitbrdf.session.materials import Material
 from traitbrdf.session.preparation import TURNS, trusted_error
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.material import Material
 from traitbrdf.transport.transport import PartFrame, Transport
 
 Float32 = NDArray[np.float32]

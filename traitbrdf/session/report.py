@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from traitbrdf.session.frames import Shown, View, measured
-from traitbrdf.session.materials import Material
 from traitbrdf.session.preparation import timed
 from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.transport import Transport
 

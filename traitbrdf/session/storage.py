@@ -20,9 +20,9 @@ from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import Mesh, Sphere, sphere
 from traitbrdf.session.cache import fingerprint
 from traitbrdf.session.frames import Said, framing_of
-from traitbrdf.session.materials import Material
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace, default_traits
 
 _FORMAT = 2

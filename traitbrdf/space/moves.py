@@ -292,7 +292,7 @@ STEEP, WALLED, COLOURED = 1, 2, 4
 
 
 @dataclass(frozen=True)
-class Move:
+class Moved:
     """What a move came to.
 
     Attributes

@@ -32,7 +32,7 @@ from traitbrdf.formats.files import artifact, unknown_name
 from traitbrdf.reflectance.descriptors import descriptors
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library, default_embedding, default_library
-from traitbrdf.space.moves import COLOURED, STEEP, STEP, WALLED, Flow, Move, Task
+from traitbrdf.space.moves import COLOURED, STEEP, STEP, WALLED, Flow, Moved, Task
 from traitbrdf.space.scores import PALE, Around, Density, Grades, Ground, Optics, Readings, unlikely
 
 if TYPE_CHECKING:
@@ -468,7 +468,7 @@ class TraitSpace:
         hold: Iterable[str] | None = None,
         photoreal: bool = True,
         method: Method = "flow",
-    ) -> Move:
+    ) -> Moved:
         """`move`, with the same errors, and all that is to be said of it."""
         found = self.reach(z, amounts, hold, photoreal, method)
         if found.stopped.startswith("held"):
@@ -486,11 +486,11 @@ class TraitSpace:
         hold: Iterable[str] | None = None,
         photoreal: bool = True,
         method: Method = "flow",
-    ) -> Move:
+    ) -> Moved:
         """`move`, and how far it came.
 
         Parameters, errors : as for `move`, but where held traits forbid the move, it stays where
-        it is and `Move.stopped` says so.
+        it is and `Moved.stopped` says so.
         """
         start = self._point(z)
         moved, held, hold = self._checked(amounts, hold)
@@ -654,7 +654,7 @@ class TraitSpace:
         flow: Flow,
         whole: float,
         room: float,
-        move: Move,
+        move: Moved,
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> str:
@@ -688,10 +688,10 @@ class TraitSpace:
         moved: Mapping[int, float],
         held: list[int],
         walled: bool = False,
-    ) -> Move:
+    ) -> Moved:
         """What came of a move to z (k,), by which all scores (t,) change."""
         made = change.tolist()
-        return Move(
+        return Moved(
             z,
             {self.names[i]: value for i, value in moved.items()},
             {self.names[i]: made[i] for i in moved},
