@@ -28,9 +28,6 @@ FLOORS = (
 """Rooms and single modules; each imports only from floors before its own."""
 
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-ARRAYS_ONLY = ("design",)
-"""Rooms that know no BRDF and no scene: they import the ground floor alone."""
-
 LONGEST = 900
 LONGER = {"reflectance/models.py"}
 """Lines of a file, and files that are a list of many things of one kind."""
@@ -135,9 +132,12 @@ def test_imports_within_a_room_make_no_circle():
 
 
 @everywhere
-def test_array_modules_know_no_brdf(path):
-    if module_of(path) in ARRAYS_ONLY:
-        assert house_imports(path) <= set(FLOORS[0])
+def test_the_document_is_plain_values(path):
+    """It shades nothing and starts no thread."""
+    if module_of(path) == "design":
+        outside = {name.split(".")[0] for name in imports_of(path)}
+        assert not outside & {"torch", "threading", "numba", "concurrent"}
+        assert not house_imports(path) & {"transport", "reference", "pictures"}
 
 
 @everywhere
@@ -202,7 +202,7 @@ def test_public_names_are_few_and_listed():
     ]
     assert len(listed) == 1, "__init__.py has to state __all__ once"
     names = listed[0]
-    assert len(names) == len(set(names)) <= 25
+    assert len(names) == len(set(names)) <= 25  # beside effects
     bound = {
         alias.asname or alias.name
         for node in ast.walk(tree)
@@ -217,6 +217,7 @@ def test_materials_and_traits_do_not_wait_for_torch():
         "import sys, traitbrdf as tb\n"
         "z = tb.default_library().coordinates[0]\n"
         "tb.default_traits().move(tb.default_embedding().clip(z), {'shiny': 0.1})\n"
+        "from traitbrdf.design import document, storage\n"
         "assert not {'torch', 'sklearn'} & set(sys.modules)\n"
         "assert tb.EditSession is tb.EditSession and 'torch' in sys.modules\n"
         "from traitbrdf.studio import session\n"

@@ -7,6 +7,8 @@ rendered at once under real light; what comes out is a real, tabulated BRDF.
 from typing import TYPE_CHECKING, Any
 
 from traitbrdf import reference as reference
+from traitbrdf.design import effects as effects
+from traitbrdf.design.effects import *  # noqa: F403  (a new effect is public at once)
 from traitbrdf.design.strokes import Stroke as Stroke
 from traitbrdf.formats.files import FormatError as FormatError
 from traitbrdf.reflectance import models as models
@@ -61,6 +63,7 @@ __all__ = [
     "studio",
     "teapot",
 ]
+__all__ += effects.__all__
 
 
 def __getattr__(name: str) -> Any:

@@ -268,9 +268,9 @@ def _speeds(
             session = EditSession(scene, fps=fps, cache=False)
             if whole is None:
                 session.prepare()
-                whole = session._view.prepared
+                whole = session.view.prepared
             else:  # of the same preparation another part is used
-                session._view.prepared = promised(whole, session.library, session.settings)
+                session.view.prepared = promised(whole, session.library, session.settings)
             promise = session.report()["promise"]
             times = _edit_times(session, 6 if quick else 60)
             found = []

@@ -22,13 +22,14 @@ _FURTHEST = 1e9  # pixels: beyond, squares of distances would lose the brush
 
 @dataclass(frozen=True)
 class Stroke:
-    """One stroke of a trait brush.
+    """One stroke of a brush.
 
     Parameters
     ----------
     points : sequence of (x, y), at least one
         The polyline in image pixels; may leave the image.
-    trait : str
+    trait : str or None
+        None is a stroke that `EditSession.paint` is given an effect for.
     amount : float
         Change of the trait's score; 1 is from typically low to typically high.
     radius : float
@@ -49,8 +50,8 @@ class Stroke:
     """
 
     points: Sequence[tuple[float, float]]
-    trait: str
-    amount: float
+    trait: str | None = None
+    amount: float = 0.0
     radius: float = 24.0
     hold: Iterable[str] | None = None
 
@@ -63,7 +64,7 @@ class Stroke:
             raise ValueError(f"points: expected at least one (x, y), got shape {line.shape}")
         if not np.all(np.abs(line) <= _FURTHEST):
             raise ValueError(f"points: expected finite coordinates of at most {_FURTHEST:g} pixels")
-        if not isinstance(self.trait, str):
+        if self.trait is not None and not isinstance(self.trait, str):
             raise TypeError(f"trait: expected a name, got {self.trait!r}")
         for name in ("amount", "radius"):
             value = getattr(self, name)
@@ -121,7 +122,8 @@ class Stroke:
 
     def _distances(self, height: int, width: int) -> tuple[NDArray[np.float64], tuple[int, ...]]:
         """Squared distances (height, width) from the polyline, right where they are within reach,
-        and the rows and columns outside of which nothing is."""
+        and the rows and columns outside of which nothing is.
+        """
         known = self.__dict__.pop("_measured", None)
         if known is not None and known[0].shape == (height, width):
             squared, box, done = known

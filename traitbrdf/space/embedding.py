@@ -15,6 +15,7 @@ decoded (`profiles`).
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -772,6 +773,14 @@ class BRDFEmbedding:
         values = self.decode_values(z).reshape(*self.grid_.shape, 3)
         table = TabulatedBRDF(self.grid_, values)
         return table if grid is None else table.regrid(grid)
+
+    def fingerprint(self) -> str:
+        """Return a name of the state: coordinates of another embedding mean other materials."""
+        digest = hashlib.sha256()
+        for name, value in sorted(self.arrays().items()):
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        return digest.hexdigest()[:16]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The fitted state as plain arrays, components in float16 (their error is 1e-3 of f)."""
