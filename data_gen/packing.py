@@ -16,10 +16,11 @@ from data_gen.tables import Progress, Tables
 from traitbrdf.recipes.materials import materials
 from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.reflectance.descriptors import PROFILE, READINGS, describe, read, reading_rows
+from traitbrdf.space.definitions import Labelled
 from traitbrdf.space.embedding import GRID, BRDFEmbedding
 from traitbrdf.space.highlights import HIGHLIGHT
 from traitbrdf.space.logmap import channel_logs
-from traitbrdf.space.scores import Grades, Optics, Readings
+from traitbrdf.space.scores import Box, Grades, Optics, Readings
 from traitbrdf.space.traits import TraitSpace
 
 COUNT = 2040
@@ -72,17 +73,17 @@ def build(
     names, weights = grading()
     grades = Grades.fit({name: described[name] for name in names})
     values = weights @ grades.of(np.stack(list(described.values()), axis=1)).T
-    marks = {name: labels(value) for name, value in zip(TRAITS, values, strict=True)}
+    marked = [
+        Labelled(name, labels(value), row, trait.meaning, trait.synonyms)
+        for (name, trait), value, row in zip(TRAITS.items(), values, weights, strict=True)
+    ]
     space = TraitSpace.fit(
         coordinates,
-        marks,
-        embedding.low_,
-        embedding.high_,
+        marked,
+        Box(embedding.low_, embedding.high_),
         tables.families,
-        embedding.body_rows(),
         Optics(few_cells(embedding, coordinates), grades),
-        weights,
-        {name: (trait.meaning, trait.synonyms) for name, trait in TRAITS.items()},
+        embedding.body_rows(),
     )
     report("traits", 1.0)
     return {
@@ -95,7 +96,7 @@ def build(
         "coordinates": coordinates,
         "descriptor_names": np.array(list(described)),
         "descriptors": np.stack(list(described.values()), axis=1).astype(np.float32),
-        "labels": np.stack([marks[name] for name in space.names]),
+        "labels": np.stack([trait.labels for trait in marked]),
     }
 
 

@@ -34,10 +34,11 @@ from traitbrdf.reflectance.measured import MeasuredBRDF
 from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import sphere
+from traitbrdf.space.definitions import straight
 from traitbrdf.space.embedding import GRID
 from traitbrdf.space.library import default_library
 from traitbrdf.space.logmap import FLOOR, OPPONENT
-from traitbrdf.space.traits import RELATED, default_traits, straight
+from traitbrdf.space.traits import RELATED, default_traits
 from traitbrdf.transport.operator import Operator
 
 Float64: TypeAlias = NDArray[np.float64]

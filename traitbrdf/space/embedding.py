@@ -172,7 +172,7 @@ class BRDFEmbedding:
         self.explained_variance_ratio_ = variance / (grey[2] + 2.0 * colour[2])
         for _ in range(_PASSES):
             self._reweighted(tables)
-        self._profiles = Profiles.of(lambda: _batches(tables), self.grid_)
+        self.profiles_ = Profiles.of(lambda: _batches(tables), self.grid_)
         self._prepare()
         coordinates = np.concatenate([self.least_squares(logs) for logs in _batches(tables)])
         self.low_, self.high_ = coordinates.min(axis=0), coordinates.max(axis=0)
@@ -583,7 +583,7 @@ class BRDFEmbedding:
         point = self.as_coordinates(z)
         clipped = self.clip(point)
         self._check_offset(offset)
-        logs, source, share, first = self._profiles.sources(self._logs(clipped))
+        logs, source, share, first = self.profiles_.sources(self._logs(clipped))
         if offset is not None:
             logs += offset.T
         index = slice(None) if cells is None else self._cell_indices(cells)
@@ -617,7 +617,7 @@ class BRDFEmbedding:
         rows = self.components_.take(source, axis=0)
         some = np.flatnonzero(share)
         if len(some):
-            last = self._profiles.last
+            last = self.profiles_.last
             own = source[some] % len(last)
             trend = self.components_[last[own] * len(last) + own] - self.components_[first[own]]
             rows[some] += share[some, None] * trend
@@ -667,7 +667,7 @@ class BRDFEmbedding:
             offset = whole.to(z)
         on = self._on(z.device, z.dtype)
         span = on.mixing @ torch.clamp(z, on.low, on.high) @ on.basis + on.mean
-        logs = self._profiles.keep(span)
+        logs = self.profiles_.keep(span)
         if offset is not None:
             logs = logs + offset.T
         f = reflectance(torch, logs)
@@ -731,7 +731,7 @@ class BRDFEmbedding:
         """f (3, cells) before its energy is checked, and its greatest directional albedo."""
         span = self._logs(z)
         self._check_offset(offset)
-        logs: Float32 = self._profiles.keep(span)
+        logs: Float32 = self.profiles_.keep(span)
         if offset is not None:
             logs += offset.T
         values: Float32 = reflectance(np, logs, out=logs)
@@ -744,7 +744,7 @@ class BRDFEmbedding:
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        decoded = self._profiles.keep(self._logs(self.encode(table) if z is None else z)).T
+        decoded = self.profiles_.keep(self._logs(self.encode(table) if z is None else z)).T
         return np.asarray(log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
     def body_rows(self) -> Float64:
@@ -781,8 +781,8 @@ class BRDFEmbedding:
             "n_components": np.array(self.n_components),
             "mean": self.mean_,
             "components": self.components_.astype(np.float16),
-            "share": self._profiles.share.astype(np.float16),
-            "grazing": self._profiles.grazing.astype(np.float16),
+            "share": self.profiles_.share.astype(np.float16),
+            "grazing": self.profiles_.grazing.astype(np.float16),
             "low": self.low_,
             "high": self.high_,
             "explained_variance_ratio": self.explained_variance_ratio_,
@@ -802,7 +802,7 @@ class BRDFEmbedding:
         result.low_ = state["low"].astype(np.float64)
         result.high_ = state["high"].astype(np.float64)
         result.explained_variance_ratio_ = state["explained_variance_ratio"].astype(np.float64)
-        result._profiles = replace(
+        result.profiles_ = replace(
             Profiles.none(result.grid_),
             share=state["share"].astype(np.float32),
             grazing=state["grazing"].astype(np.float32),

@@ -13,7 +13,8 @@ from traitbrdf.space.library import Library, default_library
 
 if TYPE_CHECKING:
     from traitbrdf.reflectance.brdf import TabulatedBRDF
-from traitbrdf.space.traits import Definition, TraitSpace, as_labels, default_traits
+from traitbrdf.space.definitions import Definition, as_labels
+from traitbrdf.space.traits import TraitSpace, default_traits
 
 Float64 = NDArray[np.float64]
 

@@ -512,6 +512,33 @@ def unlikely(log: Any) -> Any:
     return -THIN * log
 
 
+class Box(NamedTuple):
+    """The gamut box: the range of the library's coordinates.
+
+    Parameters
+    ----------
+    low, high : (k,)
+    """
+
+    low: Float64
+    high: Float64
+
+
+class Scoring(NamedTuple):
+    """How scores add up: weights @ grades + normals @ z - zero.
+
+    Parameters
+    ----------
+    weights : (t, d)
+    normals : (t, k)
+    zero : (t,)
+    """
+
+    weights: Float64
+    normals: Float64
+    zero: Float64
+
+
 class Ground(NamedTuple):
     """What scores and their slopes are had of.
 
@@ -541,18 +568,13 @@ class Ground(NamedTuple):
     @classmethod
     def of(
         cls,
-        optics: Optics | None,
-        weights: Float64,
-        normals: Float64,
-        zero: Float64,
-        span: Float64,
+        scoring: Scoring,
         stiffness: Float64,
-        low: Float64,
-        high: Float64,
-        density: Density | None,
+        box: Box,
+        optics: Optics | None = None,
+        density: Density | None = None,
     ) -> Ground:
-        """`weights` and `normals` give raw scores, `zero` (t,) is that of score 0, and `span` (t,)
-        what lies between scores 0 and 1."""
+        """Gather, as arrays of one layout, what scores are computed from."""
         none = np.zeros((0, 0))
         names, at, grade = optics.grades if optics else ((), none, none)
         return cls(
@@ -560,12 +582,12 @@ class Ground(NamedTuple):
             _places(names),
             _plain(at),
             _plain(grade),
-            _plain(weights / span[:, None]),
-            _plain(normals / span[:, None]),
-            zero / span,
+            _plain(scoring.weights),
+            _plain(scoring.normals),
+            scoring.zero,
             _plain(stiffness),
-            low,
-            high,
+            box.low,
+            box.high,
             density and Density(*map(_plain, density)),
         )
 

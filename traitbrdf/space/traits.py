@@ -15,29 +15,35 @@ where no member is near (`Density`).
 from __future__ import annotations
 
 import functools
-import io
 import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from traitbrdf.formats.files import artifact, unknown_name
 from traitbrdf.reflectance.descriptors import descriptors
+from traitbrdf.space.definitions import Definition, Labelled, Statistics, as_labels, straight
 from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.explanation import Explanation
 from traitbrdf.space.library import Library, default_embedding, default_library
 from traitbrdf.space.moves import COLOURED, STEEP, STEP, WALLED, Flow, Moved, Task
-from traitbrdf.space.scores import PALE, Around, Density, Grades, Ground, Optics, Readings, unlikely
-
-if TYPE_CHECKING:
-    from traitbrdf.reflectance.brdf import TabulatedBRDF
-    from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.scores import (
+    Around,
+    Box,
+    Density,
+    Grades,
+    Ground,
+    Optics,
+    Readings,
+    Scoring,
+    unlikely,
+)
 
 Float64 = NDArray[np.float64]
 
@@ -81,6 +87,7 @@ _NEAR = 2.5e-3  # of a score: what is as near as that is reached
 _FAR = 20.0  # units: no move is longer
 _PERCENT = np.linspace(0.0, 1.0, 101)
 _KNOWN = 32  # moves whose way is kept, to go on from
+_PARTS = ("names", "weights", "normals", "typical", "meanings", "synonyms")  # of definitions
 
 # what it costs, beside the metric of moves, that what is held changes
 _HUE = 3.0  # a degree
@@ -88,82 +95,6 @@ _CHROMA = 0.3  # a unit of a* or b*
 _LIGHTNESS = 0.2  # a unit of L*
 _LOBE = 300.0  # log RGB of the lobe
 _HOLE = 0.12  # log f by which the middle of a highlight may be darker than what is around it
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """What makes two materials differ, in numbers, words and a picture.
-
-    Attributes
-    ----------
-    traits : by trait, its score before and after
-    descriptors : by descriptor (of `DESCRIPTORS`), its value before and after
-    plausibility : before and after
-    tables : the materials themselves
-    """
-
-    traits: Mapping[str, tuple[float, float]]
-    descriptors: Mapping[str, tuple[float, float]]
-    plausibility: tuple[float, float]
-    tables: tuple[TabulatedBRDF, TabulatedBRDF]
-
-    def __str__(self) -> str:
-        change = {name: after - before for name, (before, after) in self.traits.items()}
-        most = sorted(change, key=lambda name: -abs(change[name]))
-        said = [f"{name} {change[name]:+.2f}" for name in most if abs(change[name]) >= 0.05]
-        lines = ["traits: " + (", ".join(said[:8]) or "none changed by 0.05")]
-        d = self.descriptors
-        degrees = [math.degrees(math.exp(value)) for value in d["width"]]
-        for what, (before, after), unit in (
-            ("gloss at 60 degrees", d["gloss_60"], " GU"),
-            ("half width of the lobe", (degrees[0], degrees[1]), " degrees"),
-            ("specular albedo", d["specular"], ""),
-            ("diffuse albedo", d["diffuse"], ""),
-        ):
-            lines.append(f"{what}: {before:.3g} to {after:.3g}{unit}")
-        for kind in ("diffuse", "specular"):
-            hues, chroma = d[f"{kind}_hue"], d[f"{kind}_chroma"]
-            if max(chroma) >= PALE:
-                lines.append(
-                    f"{kind} hue: {hues[0]:.0f} to {hues[1]:.0f} degrees, "
-                    f"chroma {chroma[0]:.0f} to {chroma[1]:.0f}"
-                )
-        before, after = self.plausibility
-        lines.append(f"plausibility: {before:.2f} to {after:.2f}")
-        return "\n".join(lines)
-
-    def picture(
-        self, environment: EnvironmentMap | None = None, size: int = 192
-    ) -> NDArray[np.uint8]:
-        """Spheres of both side by side (H, W, 3), sRGB bytes; None is the procedural sky."""
-        # torch comes with it
-        from traitbrdf.pictures import sheet
-
-        return sheet({"": self.tables}, ("before", "after"), environment, size)
-
-    def _repr_png_(self) -> bytes:
-        file = io.BytesIO()
-        Image.fromarray(self.picture()).save(file, "png")
-        return file.getvalue()
-
-
-@dataclass(frozen=True)
-class Definition:
-    """What makes a trait: what its score adds up.
-
-    Attributes
-    ----------
-    name, meaning : str
-    weights : (d,) of the space's graded descriptors
-    normal : (k,), the straight part
-    typical : (2,) raw scores of the library's 10th and 90th percentile
-    """
-
-    name: str
-    weights: Float64
-    normal: Float64
-    typical: Float64
-    meaning: str = ""
 
 
 class TraitSpace:
@@ -196,38 +127,30 @@ class TraitSpace:
 
     def __init__(
         self,
-        names: Sequence[str],
-        normals: ArrayLike,
-        typical: ArrayLike,
-        covariance: ArrayLike,
-        low: ArrayLike,
-        high: ArrayLike,
-        body: ArrayLike | None = None,
+        traits: Sequence[Definition],
+        box: Box,
+        statistics: Statistics,
         optics: Optics | None = None,
-        weights: ArrayLike | None = None,
-        related: ArrayLike | None = None,
-        density: Density | None = None,
-        about: Mapping[str, tuple[str, tuple[str, ...]]] | None = None,
-        limits: ArrayLike | None = None,
+        body: ArrayLike | None = None,
     ) -> None:
-        self.names = tuple(names)
-        self.normals = np.asarray(normals, np.float64)
-        self.typical = np.asarray(typical, np.float64)
-        self.covariance = np.asarray(covariance, np.float64)
-        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        t, k = len(self.names), len(self.low)
+        self.traits = tuple(traits)
+        self.names = tuple(trait.name for trait in self.traits)
+        self.box = Box(*(np.asarray(end, np.float64) for end in box))
+        self.low, self.high = self.box
         self.optics = optics
+        t, k = len(self.names), len(self.low)
         d = len(optics.grades.names) if optics else 0
-        self.weights = np.zeros((t, d)) if weights is None else np.asarray(weights, np.float64)
-        self.related = np.ones((t, t)) if related is None else np.asarray(related, np.float64)
-        self.density = density
-        self.about = dict(about or {})
+        self.normals = _rows(self.traits, "normal", k)
+        self.typical = _rows(self.traits, "typical", 2)
+        self.weights = _rows(self.traits, "weights", d)
+        known = statistics
         unlimited = np.tile([-math.inf, math.inf], (t, 1))
-        self.limits = unlimited if limits is None else np.asarray(limits, np.float64)
-        expected = {
-            "normals": (t, k), "typical": (t, 2), "covariance": (k, k), "high": (k,),
-            "weights": (t, d), "related": (t, t), "limits": (t, 2),
-        }  # fmt: skip
+        self.covariance = np.asarray(known.covariance, np.float64)
+        self.related = np.asarray(np.ones((t, t)) if known.related is None else known.related,
+                                  np.float64)  # fmt: skip
+        self.limits = np.asarray(unlimited if known.limits is None else known.limits, np.float64)
+        self.density = known.density
+        expected = {"covariance": (k, k), "high": (k,), "related": (t, t), "limits": (t, 2)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 got = getattr(self, name).shape
@@ -238,48 +161,42 @@ class TraitSpace:
         self.body = np.zeros((0, k)) if body is None else np.asarray(body, np.float64)
         if self.body.ndim != 2 or self.body.shape[1] != k or not np.isfinite(self.body).all():
             raise ValueError(f"body: expected shape (rows, {k}), got {self.body.shape}")
-        self._synonyms = {
-            other: name for name, (_, others) in self.about.items() for other in others
-        }
+        self._synonyms = {other: one.name for one in self.traits for other in one.synonyms}
         self._places = {name: i for i, name in enumerate(self.names)}
-        self._places |= {
-            other: self._places[name]
-            for other, name in self._synonyms.items()
-            if name in self._places
-        }
+        self._places |= {other: self._places[name] for other, name in self._synonyms.items()}
+        every = [*self.names, *(other for one in self.traits for other in one.synonyms)]
+        if len(self._places) < len(every):
+            twice = sorted({name for name in every if every.count(name) > 1})
+            raise ValueError(f"traits: expected each name once, got {twice} more than once")
         self._flows: OrderedDict[Any, tuple[Flow, float]] = OrderedDict()
         self._lock = threading.Lock()
         metric = self.covariance + _RIDGE * np.trace(self.covariance) / k * np.eye(k)
-        self._ground = Ground.of(
-            optics, self.weights, self.normals, self.typical[:, 0], self._span,
-            np.linalg.inv(metric), self.low, self.high, density,
-        )  # fmt: skip
+        span = self._span[:, None]
+        scoring = Scoring(self.weights / span, self.normals / span, self.typical[:, 0] / self._span)
+        self._ground = Ground.of(scoring, np.linalg.inv(metric), self.box, optics, self.density)
 
     @classmethod
     def fit(
         cls,
         coordinates: ArrayLike,
-        labels: Mapping[str, ArrayLike],
-        low: ArrayLike,
-        high: ArrayLike,
+        traits: Sequence[Labelled],
+        box: Box,
         families: Sequence[str] | None = None,
-        body: ArrayLike | None = None,
         optics: Optics | None = None,
-        weights: ArrayLike | None = None,
-        about: Mapping[str, tuple[str, tuple[str, ...]]] | None = None,
+        body: ArrayLike | None = None,
     ) -> TraitSpace:
         """Traits from labelled members, and from graded descriptors where there are weights.
 
         Parameters
         ----------
         coordinates : (n, k) array_like
-        labels : for each trait (n,) values: 1 has it, -1 has it not, 0 unclear
-        low, high : (k,) gamut box
+        traits : sequence of Labelled
+        box : Box
         families : (n,) names or None
             Kinds of material. Moves then follow how members differ from others of their kind,
             and only a little how kinds differ: a shinier plastic is a plastic still, and no metal.
             They are also what `Density` is made of; None leaves it out.
-        body, optics, weights, about : as for `TraitSpace`
+        optics, body : as for `TraitSpace`
             A trait whose weights are not all zero is read off descriptors, others are straight.
 
         Raises
@@ -288,9 +205,16 @@ class TraitSpace:
             If a trait's labels are of one class only, or of a wrong shape.
         """
         z = np.asarray(coordinates, np.float64)
-        normals = np.array([straight(z, given, name) for name, given in labels.items()])
-        if weights is not None:
-            normals[np.any(np.asarray(weights) != 0.0, axis=1)] = 0.0
+        unscaled = []
+        for name, labels, given, meaning, synonyms in traits:
+            d = len(optics.grades.names) if optics else 0
+            weights = np.zeros(d) if given is None else np.asarray(given, np.float64)
+            known = as_labels(labels, len(z), name)
+            read = bool(np.any(weights != 0.0))
+            normal = np.zeros(z.shape[1]) if read else straight(z, known, name)
+            unscaled.append(
+                Definition(name, weights, normal, np.array([0.0, 1.0]), meaning, synonyms)
+            )
         covariance, density = np.cov(z.T), None
         if families is not None:
             kinds = np.asarray(families)
@@ -301,19 +225,14 @@ class TraitSpace:
                 centred[kinds == kind] -= z[kinds == kind].mean(axis=0)
             covariance = np.cov(centred.T) + _BETWEEN * covariance
             density = Density.fit(z, list(families))
-        unscaled = np.tile([0.0, 1.0], (len(normals), 1))
-        space = cls(
-            list(labels), normals, unscaled, covariance, low, high, body, optics, weights,
-            None, density, about,
-        )  # fmt: skip
-        raw = space._raw(z)
+        statistics = Statistics(covariance, density=density)
+        raw = cls(unscaled, box, statistics, optics, body)._raw(z)
         typical = np.percentile(raw, [10.0, 90.0], axis=0).T
         limits = np.percentile(raw, _EXTREMES, axis=0).T - typical[:, :1]
         limits /= np.maximum(typical[:, 1:] - typical[:, :1], 1e-300)
-        return cls(
-            list(labels), normals, typical, covariance, low, high, body, optics, weights,
-            _rank_correlations(raw), density, about, limits,
-        )  # fmt: skip
+        scaled = [replace(one, typical=ends) for one, ends in zip(unscaled, typical, strict=True)]
+        statistics = replace(statistics, related=_rank_correlations(raw), limits=limits)
+        return cls(scaled, box, statistics, optics, body)
 
     def __repr__(self) -> str:
         return f"TraitSpace({', '.join(self.names)})"
@@ -332,8 +251,8 @@ class TraitSpace:
 
     def meaning(self, name: str) -> str:
         """One line that says what a trait means."""
-        known = self.names[self.index(name)]
-        return self.about[known][0] if known in self.about else known
+        trait = self.traits[self.index(name)]
+        return trait.meaning or trait.name
 
     # -- scores ---------------------------------------------------------------------------------
 
@@ -348,17 +267,41 @@ class TraitSpace:
     def grades(self, z: ArrayLike) -> Float64:
         """Graded descriptors (..., d) at coordinates (..., k): how common in the library what is
         read there is, in standard deviations; `optics.grades.names` are their names."""
+        self._reads()
+        return self._ground.grades(np.asarray(z, np.float64))
+
+    def _reads(self) -> None:
+        """Raise ValueError unless descriptors are read."""
         if self.optics is None:
             raise ValueError(
                 "space: expected one that reads descriptors, got straight traits alone"
             )
-        return self._ground.grades(np.asarray(z, np.float64))
 
     def _raw(self, z: Float64) -> Float64:
         raw: Float64 = z @ self.normals.T
         if self.optics is not None:
             raw = raw + self.grades(z) @ self.weights.T
         return raw
+
+    def colours(self, z: ArrayLike) -> Float64:
+        """Return the colours that a person sees at a point, as CIELAB.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        (5, 3) array
+            L*, a* and b* of each of `traitbrdf.space.scores.SURFACES`.
+
+        Raises
+        ------
+        ValueError
+            If this space reads no descriptors, or `z` is not k finite numbers.
+        """
+        self._reads()
+        return self._ground.seen(self._point(z))
 
     def plausibility(self, z: ArrayLike) -> float:
         """The share of the library that lies in less likely places than z (k,): 0 is unheard of.
@@ -730,24 +673,22 @@ class TraitSpace:
         trait : Definition, as `traitbrdf.Trait`
         library : whose members say how traits are related; None is the default one
         """
-        kept = [i for i, name in enumerate(self.names) if name != trait.name]
-        names = [*(self.names[i] for i in kept), trait.name]
         if trait.name in self._synonyms:
             raise ValueError(
                 f"name: {trait.name!r} is an everyday name of {self._synonyms[trait.name]!r}; "
                 "expected another"
             )
-        about = {**self.about, trait.name: (trait.meaning or trait.name, ())}
-        new = TraitSpace(
-            names, np.vstack([self.normals[kept], trait.normal]),
-            np.vstack([self.typical[kept], trait.typical]), self.covariance, self.low, self.high,
-            self.body, self.optics, np.vstack([self.weights[kept], trait.weights]),
-            None, self.density, about,
-        )  # fmt: skip
+        traits = [one for one in self.traits if one.name != trait.name]
+        traits.append(replace(trait, meaning=trait.meaning or trait.name))
+        statistics = Statistics(self.covariance, density=self.density)
+        new = TraitSpace(traits, self.box, statistics, self.optics, self.body)
         coordinates = (default_library() if library is None else library).coordinates
-        new.related = _rank_correlations(new._raw(coordinates))
-        new.limits = np.percentile(new.scores(coordinates), _EXTREMES, axis=0).T
-        return new
+        statistics = replace(
+            statistics,
+            related=_rank_correlations(new._raw(coordinates)),
+            limits=np.percentile(new.scores(coordinates), _EXTREMES, axis=0).T,
+        )
+        return TraitSpace(traits, self.box, statistics, self.optics, self.body)
 
     # -- files ----------------------------------------------------------------------------------
 
@@ -762,10 +703,8 @@ class TraitSpace:
             "trait_weights": self.weights,
             "trait_related": self.related,
             "trait_limits": self.limits,
-            "trait_meanings": np.array([self.about.get(n, ("",))[0] for n in self.names]),
-            "trait_synonyms": np.array(
-                ["|".join(self.about[n][1]) if n in self.about else "" for n in self.names]
-            ),
+            "trait_meanings": np.array([trait.meaning for trait in self.traits]),
+            "trait_synonyms": np.array(["|".join(trait.synonyms) for trait in self.traits]),
         }
         if self.optics is not None:
             state |= {f"reading_{k}": v for k, v in self.optics.readings._asdict().items()}
@@ -791,52 +730,28 @@ class TraitSpace:
             )
         if "density_means" in state:
             density = Density(*group("density", Density._fields))
-        names = [str(n) for n in state["trait_names"]]
-        about = {
-            name: (str(meaning), tuple(str(others).split("|")) if str(others) else ())
-            for name, meaning, others in zip(
-                names, state["trait_meanings"], state["trait_synonyms"], strict=True
+        traits = [
+            Definition(
+                str(name), weights, normal, typical, str(meaning),
+                tuple(str(others).split("|")) if str(others) else (),
             )
-            if str(meaning)
-        }
-        return cls(
-            names, state["trait_normals"], state["trait_typical"], state["covariance"],
-            state["low"], state["high"], state["body"], optics, state["trait_weights"],
-            state["trait_related"], density, about, state["trait_limits"],
-        )  # fmt: skip
-
-
-def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> Float64:
-    """Trait vector (k,) between labelled members: the normal of a linear support vector machine,
-    or the difference of class means (both in Matusik et al. 2003, section 5).
-
-    Raises
-    ------
-    ValueError
-        If labels are of one class only, of a wrong shape, or others than -1, 0 and 1.
-    """
-    label = as_labels(labels, len(z), name)
-    if means:
-        return np.asarray(z[label == 1].mean(axis=0) - z[label == -1].mean(axis=0))
-    from sklearn.svm import LinearSVC  # slow to import, and needed only here
-
-    scale = np.maximum(z.std(axis=0), 1e-9)
-    clear = label != 0
-    machine = LinearSVC(C=0.1, dual=False).fit(z[clear] / scale, label[clear])
-    return np.asarray(machine.coef_[0] / scale, np.float64)
-
-
-def as_labels(labels: ArrayLike, count: int, name: str) -> NDArray[Any]:
-    """Labels (count,) of -1, 0 and 1, of both classes."""
-    label = np.asarray(labels)
-    if label.shape != (count,) or not np.isin(label, (-1, 0, 1)).all():
-        raise ValueError(
-            f"labels of {name!r}: expected ({count},) values of -1, 0 or 1, "
-            f"got shape {label.shape}: {label!r}"
+            for name, weights, normal, typical, meaning, others in zip(
+                *(state[f"trait_{part}"] for part in _PARTS), strict=True
+            )
+        ]  # fmt: skip
+        statistics = Statistics(
+            state["covariance"], state["trait_related"], state["trait_limits"], density
         )
-    if not ((label == 1).any() and (label == -1).any()):
-        raise ValueError(f"labels of {name!r}: expected materials with and without it")
-    return label
+        return cls(traits, Box(state["low"], state["high"]), statistics, optics, state["body"])
+
+
+def _rows(traits: Sequence[Definition], part: str, size: int) -> Float64:
+    """Stack a part (size,) of definitions (t,) to an array (t, size)."""
+    rows = [np.asarray(getattr(trait, part), np.float64) for trait in traits]
+    for trait, row in zip(traits, rows, strict=True):
+        if row.shape != (size,):
+            raise ValueError(f"{part} of {trait.name!r}: expected shape ({size},), got {row.shape}")
+    return np.array(rows, np.float64).reshape(len(rows), size)
 
 
 def _rank_correlations(raw: Float64) -> Float64:
