@@ -15,16 +15,24 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Definition:
-    """What makes a trait: what its score adds up.
+    """A trait as a weighted sum of graded descriptors and coordinates.
+
+    The raw score at coordinates z is ``weights @ grades(z) + normal @ z``. Scores are raw scores
+    scaled so that `typical` becomes 0 and 1.
 
     Attributes
     ----------
     name : str
-    weights : (d,) of the space's graded descriptors
-    normal : (k,), the straight part
-    typical : (2,) raw scores of the library's 10th and 90th percentile
+    weights : (d,) float64
+        Weights of the space's graded descriptors.
+    normal : (k,) float64
+        Gradient of the straight part; zeros if the trait reads descriptors alone.
+    typical : (2,) float64
+        Raw scores of the library's 10th and 90th percentile, ascending.
     meaning : str
+        One line that explains the trait.
     synonyms : tuple of str
+        Everyday names that stand for the trait.
     """
 
     name: str
@@ -36,15 +44,20 @@ class Definition:
 
 
 class Labelled(NamedTuple):
-    """A trait as labelled members of a library show it, of which a fit makes a `Definition`.
+    """A trait and the labels of library members, to which `TraitSpace.fit` fits a `Definition`.
 
     Parameters
     ----------
     name : str
     labels : (n,) array_like
+        1 has the trait, -1 does not have it, 0 is unclear.
     weights : (d,) array_like or None
+        Weights of graded descriptors. If all are zero or left out, the trait is straight: the
+        normal of the plane that separates the labels.
     meaning : str
+        One line that explains the trait.
     synonyms : tuple of str
+        Everyday names that stand for the trait.
     """
 
     name: str
@@ -61,9 +74,14 @@ class Statistics:
     Attributes
     ----------
     covariance : (k, k) array_like
+        Covariance of the coordinates: moves are short in its Mahalanobis distance.
     related : (t, t) array_like or None
+        Rank correlations of the scores; None takes all traits for related.
     limits : (t, 2) array_like or None
+        Scores of the 1st and 99th percentile, which photoreal moves do not pass; None sets no
+        limits.
     density : Density or None
+        Where the members are; with None moves may go anywhere in the gamut box.
     """
 
     covariance: ArrayLike
@@ -73,8 +91,24 @@ class Statistics:
 
 
 def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> Float64:
-    """Trait vector (k,) between labelled members: the normal of a linear support vector machine,
-    or the difference of class means (both in Matusik et al. 2003, section 5).
+    """Fit the direction between members with a trait and members without it.
+
+    It is the normal of a linear support vector machine, or the difference of class means (both in
+    Matusik et al. 2003, section 5).
+
+    Parameters
+    ----------
+    z : (n, k) float64
+        Coordinates of the members.
+    labels : (n,) array_like of -1, 0 and 1
+    name : str
+        The trait's name, for error messages.
+    means : bool
+        Whether to take the difference of class means.
+
+    Returns
+    -------
+    (k,) float64
 
     Raises
     ------
@@ -93,7 +127,24 @@ def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> F
 
 
 def as_labels(labels: ArrayLike, count: int, name: str) -> NDArray[Any]:
-    """Labels (count,) of -1, 0 and 1, of both classes."""
+    """Return labels as an array, after checking them.
+
+    Parameters
+    ----------
+    labels : (count,) array_like of -1, 0 and 1
+    count : int
+    name : str
+        The trait's name, for error messages.
+
+    Returns
+    -------
+    (count,) array
+
+    Raises
+    ------
+    ValueError
+        If labels are of one class only, of a wrong shape, or others than -1, 0 and 1.
+    """
     label = np.asarray(labels)
     if label.shape != (count,) or not np.isin(label, (-1, 0, 1)).all():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What makes two materials differ: numbers, words and a picture."""
+"""How two materials differ, in numbers, words and a picture."""
 
 from __future__ import annotations
 
@@ -21,14 +21,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What makes two materials differ, in numbers, words and a picture.
+    """How two materials differ, in numbers, words and a picture.
 
     Attributes
     ----------
-    traits : by trait, its score before and after
-    descriptors : by descriptor (of `DESCRIPTORS`), its value before and after
-    plausibility : before and after
-    tables : the materials themselves
+    traits : mapping of (float, float)
+        By trait, its score before and after.
+    descriptors : mapping of (float, float)
+        By name (`traitbrdf.reflectance.descriptors.DESCRIPTORS`), a descriptor before and after.
+    plausibility : (float, float)
+        `TraitSpace.plausibility` before and after, in [0, 1].
+    tables : (TabulatedBRDF, TabulatedBRDF)
+        The materials themselves.
     """
 
     traits: Mapping[str, tuple[float, float]]
@@ -64,8 +68,20 @@ class Explanation:
     def picture(
         self, environment: EnvironmentMap | None = None, size: int = 192
     ) -> NDArray[np.uint8]:
-        """Spheres of both side by side (H, W, 3), sRGB bytes; None is the procedural sky."""
-        # torch comes with it
+        """Render spheres of both materials side by side.
+
+        Parameters
+        ----------
+        environment : EnvironmentMap, optional
+            The light; a procedural sky if left out.
+        size : int
+            Height and width of a sphere, in pixels.
+
+        Returns
+        -------
+        (H, W, 3) uint8, sRGB
+        """
+        # this import loads torch
         from traitbrdf.pictures import sheet
 
         return sheet({"": self.tables}, ("before", "after"), environment, size)
