@@ -15,10 +15,11 @@ from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.reflectance.descriptors import DESCRIPTORS, cielab, descriptors, hue
 from traitbrdf.space.definitions import Definition, Labelled, Statistics
 from traitbrdf.space.embedding import GRID
+from traitbrdf.space.holding import COLOURS, KEEPS_BODY, LIGHT
 from traitbrdf.space.learning import Trait, suggest
 from traitbrdf.space.library import default_embedding, default_library
 from traitbrdf.space.scores import Box
-from traitbrdf.space.traits import COLOURS, KEEPS_BODY, LIGHT, TraitSpace, default_traits
+from traitbrdf.space.traits import TraitSpace, default_traits
 
 EMBEDDING = default_embedding()
 LIBRARY = default_library()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -154,3 +155,46 @@ def as_labels(labels: ArrayLike, count: int, name: str) -> NDArray[Any]:
     if not ((label == 1).any() and (label == -1).any()):
         raise ValueError(f"labels of {name!r}: expected materials with and without it")
     return label
+
+
+def stacked(traits: Sequence[Definition], part: str, size: int) -> Float64:
+    """Stack one part of several definitions.
+
+    Parameters
+    ----------
+    traits : t Definition
+    part : "weights", "normal" or "typical"
+    size : int
+        Its expected length.
+
+    Returns
+    -------
+    (t, size) float64
+
+    Raises
+    ------
+    ValueError
+        On another length; the message names the trait.
+    """
+    rows = [np.asarray(getattr(trait, part), np.float64) for trait in traits]
+    for trait, row in zip(traits, rows, strict=True):
+        if row.shape != (size,):
+            raise ValueError(f"{part} of {trait.name!r}: expected shape ({size},), got {row.shape}")
+    return np.array(rows, np.float64).reshape(len(rows), size)
+
+
+def rank_correlations(values: Float64) -> Float64:
+    """Return Spearman's rank correlations of columns; ties share ranks.
+
+    Parameters
+    ----------
+    values : (n, t) float64
+
+    Returns
+    -------
+    (t, t) float64
+    """
+    # scipy.stats takes a while to load, and is needed here alone
+    from scipy.stats import rankdata
+
+    return np.atleast_2d(np.corrcoef(rankdata(values, axis=0).T))

@@ -234,3 +234,25 @@ def cell_weight(grid: HalfDiffGrid) -> Float32:
     (cells,) float32, 0 below the horizon
     """
     return np.asarray(np.sqrt(np.maximum(grid.lower_cosine, 0.0)).ravel(), np.float32)
+
+
+def channel_mixing(n_components: tuple[int, int]) -> NDArray[np.float64]:
+    """Return how coordinates add up to each channel's scores on the principal components.
+
+    Parameters
+    ----------
+    n_components : (int, int)
+        Components of the mean of the channels, and of each of the two colour axes; m in all.
+
+    Returns
+    -------
+    (3, m, k) float64
+    """
+    achromatic, chromatic = n_components
+    result = np.zeros((3, achromatic + chromatic, achromatic + 2 * chromatic))
+    grey, red_blue, green = OPPONENT
+    result[:, :achromatic, :achromatic] = grey[:, None, None] * np.eye(achromatic)
+    middle = achromatic + chromatic
+    result[:, achromatic:, achromatic:middle] = red_blue[:, None, None] * np.eye(chromatic)
+    result[:, achromatic:, middle:] = green[:, None, None] * np.eye(chromatic)
+    return result

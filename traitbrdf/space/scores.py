@@ -171,11 +171,11 @@ class Grades(NamedTuple):
 
     @classmethod
     def fit(cls, values: Mapping[str, ArrayLike], knots: int = 129) -> Grades:
-        """Compute normal scores of smoothed distributions (kernel estimates, Silverman 1986,
-        chapter 2).
+        """Compute normal scores of smoothed distributions.
 
-        Many members share a value (no tint at all, for example). Without smoothing the grade would
-        have a step there, and moves of a trait would jump.
+        The distributions are kernel estimates (Silverman 1986, chapter 2). Many members share a
+        value (no tint at all, for example): without smoothing the grade would have a step there,
+        and moves of a trait would jump.
 
         Parameters
         ----------
