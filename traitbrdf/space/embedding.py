@@ -328,10 +328,10 @@ class BRDFEmbedding:
     def _refined(self, start: Float64, logs: Float32, weight: Float64) -> Float64:
         """Return the point of the gamut box that best shows a table, starting near by.
 
-        It minimises two costs: deviations of log(f + FLOOR) from `logs` (3, cells), robust (`_ROBUST`)
-        and with weights (3, cells); and squared deviations of visible radiance under natural light
-        (`natural_light`), relative to all of it, with deviation `_SEEN`. Levenberg-Marquardt steps,
-        within the box.
+        It minimises two costs: deviations of log(f + FLOOR) from `logs` (3, cells), robust
+        (`_ROBUST`) and with weights (3, cells); and squared deviations of visible radiance under
+        natural light (`natural_light`), relative to all of it, with deviation `_SEEN`.
+        Levenberg-Marquardt steps, within the box.
         """
         import torch
 
@@ -562,8 +562,8 @@ class BRDFEmbedding:
     def energy_scale(self, z: ArrayLike, offset: Float32 | None = None) -> float:
         """Return the factor in (0, 1] by which `decode_values` lowers f to conserve energy.
 
-        Below 1 the shown material is darker than its coordinates say, and its traits are less pronounced
-        than their scores.
+        Below 1 the shown material is darker than its coordinates say, and its traits are less
+        pronounced than their scores.
 
         Parameters
         ----------
