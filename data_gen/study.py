@@ -305,7 +305,8 @@ def study(
     Candidate
     dict of float
         "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL", "PSNR, dB"
-        and "FLIP" (of the RGL materials on a sphere under three maps): those for which there is data.
+        and "FLIP" (of the RGL materials on a sphere under three maps): those for which there is
+        data.
     """
     report = progress or (lambda stage, fraction: None)
     sets = [] if data is None else measured_sets(data, 16, 6)
@@ -381,7 +382,8 @@ def trait_table() -> str:
 
     Accuracy is the rank correlation with the grades of the members' own tables: of the normal of a
     linear support vector machine and of the difference of class means, on every fifth member after
-    a fit to the others' labels, and of the shipped scores, of which only the grades' scale is fitted.
+    a fit to the others' labels, and of the shipped scores, of which only the grades' scale is
+    fitted.
     """
     library, space = default_library(), default_traits()
     assert space.optics is not None

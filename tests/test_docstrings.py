@@ -23,7 +23,9 @@ def section(docstring: str, title: str) -> list[str] | None:
         if lines[rule - 1].strip() == title:
             end = min((i - 1 for i in rules if i > rule), default=len(lines))
             # prose after a blank line belongs to no entry
-            prose = (i for i in range(rule + 1, end - 1) if not lines[i] and lines[i + 1][:1].strip())
+            prose = (
+                i for i in range(rule + 1, end - 1) if not lines[i] and lines[i + 1][:1].strip()
+            )
             end = min(prose, default=end)
             entries = [line for line in lines[rule + 1 : end] if line and not line[0].isspace()]
             return [name.strip() for line in entries for name in line.split(" : ")[0].split(",")]
