@@ -34,7 +34,7 @@ LONGER = {"reflectance/models.py"}
 
 HOMES = {
     "OpenEXR": {"formats/images.py"},
-    "sklearn": {"space/embedding.py", "space/traits.py"},
+    "sklearn": {"space/fitting.py", "space/definitions.py"},
     "embreex": {"scene/shapes.py"},
     "trimesh": {"scene/shapes.py", "scene/meshes.py"},
     "numba": {

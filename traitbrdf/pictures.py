@@ -34,6 +34,7 @@ def spheres(
     ----------
     tables : n tables of one folded grid
     environment : None is the procedural sky
+    size : height and width of an image, in pixels
 
     Raises
     ------

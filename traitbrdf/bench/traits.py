@@ -34,8 +34,9 @@ from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.reflectance.descriptors import READINGS, cielab, describe_columns, hue, reading_rows
 from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.holding import COLOURS, LIGHT
 from traitbrdf.space.library import default_library
-from traitbrdf.space.traits import COLOURS, LIGHT, RELATED, Method, TraitSpace, default_traits
+from traitbrdf.space.traits import RELATED, Method, TraitSpace, default_traits
 
 Int64 = NDArray[np.int64]
 Float64 = NDArray[np.float64]
