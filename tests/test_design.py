@@ -353,6 +353,25 @@ def test_designs_are_values(edit):
     assert "1 layers" in repr(first)
 
 
+def test_a_trait_of_one_s_own_leaves_the_design_as_it_is(edit):
+    edit.assign("body", "red-rubber")
+    edit.move("body", shiny=0.4)
+    before = edit.material("body")
+    edit.add_trait(Trait.from_labels("candy", ["blue-plastic", "red-rubber"], [1, -1]))
+    assert edit.material("body") is before
+    edit.layers[0].opacity = 0.5
+    edit.layers[0].opacity = 1.0
+    same(edit.material("body").z, before.z)
+    edit.move("body", candy=0.2)
+    moved = edit.material("body")
+    # what it means is changed: the layer follows
+    edit.add_trait(Trait.from_labels("candy", ["blue-plastic", "red-rubber"], [-1, 1]))
+    assert np.abs(edit.material("body").z - moved.z).max() > 0.01
+    with pytest.raises(ValueError, match="unknown trait 'candy'"):
+        edit.traits = tb.default_traits()
+    assert edit.scores("body")["candy"] > -9.0  # nothing has changed
+
+
 # -- history ----------------------------------------------------------------------------------
 
 parts = st.sampled_from(["body", "handle", "spout", "lid"])

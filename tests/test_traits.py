@@ -580,6 +580,22 @@ def test_a_trait_is_learnt_from_a_handful_of_labels():
     assert replaced.score(z)["tinny"] == pytest.approx(1.0 - space.score(z)["tinny"], abs=1e-6)
 
 
+def test_a_trait_of_one_s_own_leaves_moves_of_others_as_they_are():
+    mine = Trait.from_labels("candy", ["blue-plastic", "red-rubber"], [1, -1])
+    other = Trait.from_labels("bleak", ["chrome", "red-rubber"], [-1, 1])
+    space = SPACE.with_trait(mine).with_trait(other)
+    again = TraitSpace.from_arrays({**space.arrays(), "low": LOW, "high": HIGH})
+    rng = np.random.default_rng(5)
+    for name in SPACE.names:
+        z = LIBRARY.coordinates[rng.integers(len(LIBRARY))]
+        amount = rng.uniform(-0.5, 0.5)
+        expected = SPACE.move(z, {name: amount})
+        np.testing.assert_array_equal(space.move(z, {name: amount}), expected)
+        np.testing.assert_array_equal(again.move(z, {name: amount}), expected)
+    with pytest.raises(ValueError, match="unknown trait"):
+        SPACE.move(z, {"candy": 0.1})
+
+
 def test_a_trait_is_learnt_from_ratings_of_tables_and_coordinates():
     some = LIBRARY.coordinates[::400]
     ratings = SPACE.scores(some)[:, SPACE.index("bright")]

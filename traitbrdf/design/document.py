@@ -216,14 +216,21 @@ class Document:
 
     @property
     def palette(self) -> Palette:
-        """What effects are applied with; setting it applies all layers anew."""
+        """What effects are applied with; layers are applied anew unless it has only grown."""
         return self._palette
 
     @palette.setter
     def palette(self, palette: Palette) -> None:
         old = self._palette, self._states, self._folded, self._outcomes
-        self._palette, self._outcomes = palette, OrderedDict()
-        self._folded, self._states = replace(self._folded, layers=()), self._states[:1]
+        self._palette = palette
+        traits = {id(trait) for trait in palette.traits.traits}
+        grown = palette.library is old[0].library and all(
+            id(trait) in traits for trait in old[0].traits.traits
+        )
+        if grown:  # moves of the other traits stay as they are
+            return
+        self._outcomes, self._states = OrderedDict(), self._states[:1]
+        self._folded = replace(self._folded, layers=())
         try:
             self._fold(self.design)
         except Exception:

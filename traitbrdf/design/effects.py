@@ -233,6 +233,8 @@ class Assign(Effect):
     Parameters
     ----------
     material : a library name, a `TabulatedBRDF`, a model or measured BRDF, or coordinates (k,)
+    known : Material or None
+        What `material` came to with the palette at hand; None finds it when it is needed.
 
     Raises
     ------

@@ -198,3 +198,26 @@ def rank_correlations(values: Float64) -> Float64:
     from scipy.stats import rankdata
 
     return np.atleast_2d(np.corrcoef(rankdata(values, axis=0).T))
+
+
+def with_one_more(related: Float64, raw: Float64) -> Float64:
+    """Return the correlations of traits and one more, which moves of the others do not spare.
+
+    Parameters
+    ----------
+    related : (t, t) float64
+        Rank correlations of the traits that are known already.
+    raw : (n, t + 1) float64
+        Raw scores of the members of a library, the new trait last.
+
+    Returns
+    -------
+    (t + 1, t + 1) float64
+        The new trait's row holds its rank correlations. Its column is 1, as if all traits were
+        related to it: moves spare what is not related, and those of the others shall stay as they
+        are.
+    """
+    found = np.ones((len(related) + 1, len(related) + 1))
+    found[:-1, :-1] = related
+    found[-1] = rank_correlations(raw)[-1]
+    return found

@@ -849,11 +849,9 @@ class BRDFEmbedding:
 
     def fingerprint(self) -> str:
         """Return a name of the state: coordinates of another embedding mean other materials."""
-        digest = hashlib.sha256()
-        for name, value in sorted(self.arrays().items()):
-            digest.update(name.encode())
-            digest.update(np.ascontiguousarray(value).tobytes())
-        return digest.hexdigest()[:16]
+        state = sorted(self.arrays().items())
+        whole = b"".join(n.encode() + np.ascontiguousarray(v).tobytes() for n, v in state)
+        return hashlib.sha256(whole).hexdigest()[:16]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the fitted state as plain arrays.

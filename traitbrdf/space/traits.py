@@ -33,6 +33,7 @@ from traitbrdf.space.definitions import (
     rank_correlations,
     stacked,
     straight,
+    with_one_more,
 )
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.explanation import Explanation
@@ -782,13 +783,14 @@ class TraitSpace:
     def with_trait(self, trait: Definition, library: Library | None = None) -> TraitSpace:
         """Return this space with one trait more; a trait of the same name is replaced.
 
+        Moves of other traits stay as they are, to the bit.
+
         Parameters
         ----------
         trait : Definition
             A `traitbrdf.Trait`, for example.
         library : Library, optional
-            Whose members say how traits are related, and how far they go; the default one if left
-            out.
+            Whose members say how traits are related, and how far they go; None is the default.
 
         Raises
         ------
@@ -800,16 +802,15 @@ class TraitSpace:
                 f"name: {trait.name!r} is an everyday name of {self._synonyms[trait.name]!r}; "
                 "expected another"
             )
-        traits = [one for one in self.traits if one.name != trait.name]
-        traits.append(replace(trait, meaning=trait.meaning or trait.name))
+        kept = [i for i, one in enumerate(self.traits) if one.name != trait.name]
+        trait = replace(trait, meaning=trait.meaning or trait.name)
+        traits = [*(self.traits[i] for i in kept), trait]
         statistics = Statistics(self.covariance, density=self.density)
         new = TraitSpace(traits, self.box, statistics, self.optics, self.body)
-        coordinates = (default_library() if library is None else library).coordinates
-        statistics = replace(
-            statistics,
-            related=rank_correlations(new._raw(coordinates)),
-            limits=np.percentile(new.scores(coordinates), _EXTREMES, axis=0).T,
-        )
+        z = (library or default_library()).coordinates
+        related = with_one_more(self.related[np.ix_(kept, kept)], new._raw(z))
+        limits = np.vstack([self.limits[kept], np.percentile(new.scores(z)[:, -1], _EXTREMES)])
+        statistics = replace(statistics, related=related, limits=limits)
         return TraitSpace(traits, self.box, statistics, self.optics, self.body)
 
     # -- files ----------------------------------------------------------------------------------
