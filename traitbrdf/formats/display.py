@@ -100,7 +100,7 @@ class Display:
         self._table = np.ascontiguousarray(grey[:, 0])
 
     def __call__(self, linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return 8-bit sRGB (..., 3) of `linear` radiance (..., 3), which is not negative or NaN."""
+        """Return 8-bit sRGB (..., 3) of `linear` radiance (..., 3), not negative and not NaN."""
         scaled = linear * np.float32(self.exposure * self._STEPS)
         np.minimum(scaled, np.float32(len(self._table) - 1), out=scaled)
         return self._table[scaled.astype(np.uint16)]
