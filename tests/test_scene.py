@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from traitbrdf.scene.camera import MAX_SIDE, Camera
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
-from traitbrdf.scene.scene import GROUND, Scene, _pattern
+from traitbrdf.scene.scene import GROUND, Scene, sample_pattern
 from traitbrdf.scene.shapes import Mesh, sphere
 from traitbrdf.scene.teapot import teapot
 
@@ -280,7 +280,7 @@ def test_antialiasing_finds_the_area_better():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 16, 256])
 def test_an_edge_along_the_axes_comes_out_in_equal_steps(count):
-    x, y = _pattern(count)
+    x, y = sample_pattern(count)
     steps = (np.arange(count) + 0.5) / count
     np.testing.assert_allclose(np.sort(x), steps)
     np.testing.assert_allclose(np.sort(y), steps)
@@ -745,7 +745,7 @@ def test_rays_are_cast_in_chunks(monkeypatch, small_teapot):
 
     whole = answers()
     rng = np.random.default_rng(0)
-    monkeypatch.setattr("traitbrdf.scene.scene._CHUNK", 37)
+    monkeypatch.setattr("traitbrdf.scene.scene.RAYS_AT_ONCE", 37)
     for a, b in zip(whole, answers(), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -143,7 +143,7 @@ _GOLD = np.log([1.0, 0.753, 0.374])  # linear Rec.709, over the greatest channel
 
 
 def cielab(rgb: ArrayLike) -> Float64:
-    """Return CIE 1976 L*a*b* (..., 3) of linear Rec.709 `rgb` (..., 3), with white (1, 1, 1), D65."""
+    """Return CIE 1976 L*a*b* (..., 3) of linear Rec.709 `rgb` (..., 3); white (1, 1, 1) is D65."""
     linear = np.maximum(np.asarray(rgb, np.float64), 0.0)
     xyz = linear @ WHITE.T
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz * (29 / 6) ** 2 / 3 + 4 / 29)
