@@ -14,7 +14,7 @@ from PIL import Image
 import traitbrdf as tb
 from traitbrdf.bench import datasets, peers
 from traitbrdf.bench.datasets import HELD_OUT, unseen
-from traitbrdf.bench.edits import _frame_error, _peak_memory
+from traitbrdf.bench.edits import frame_error, peak_memory
 from traitbrdf.bench.oracle import Oracle, draw_fragments, reference_values
 from traitbrdf.bench.records import ON_REQUEST, Record
 from traitbrdf.bench.rivals import texel_sum, texel_sum_torch
@@ -292,7 +292,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
     session = tb.EditSession(scene, quality="preview")
     session.assign("sphere", "white-plaster")
     frame = session.render()
-    stated = _frame_error(session, len(scene.pixels), np.random.default_rng(0))
+    stated = frame_error(session, len(scene.pixels), np.random.default_rng(0))
     brdfs = {name: session.brdf(name) for name in scene.parts}
     true = tb.reference.render(scene, brdfs, 1e-3).reshape(-1, 3)
     backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
@@ -305,7 +305,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
 
 
 def test_peak_memory() -> None:
-    peak = _peak_memory()
+    peak = peak_memory()
     assert peak is None or 0.05 < peak < 100.0
 
 

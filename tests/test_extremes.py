@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from traitbrdf import reference
-from traitbrdf.bench.trade import _sheet
+from traitbrdf.bench.trade import surface_mesh
 from traitbrdf.directions import latlong_to_direction, to_local
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.reflectance.models import GGX, BoundedPhong, Lambert
@@ -83,7 +83,7 @@ def ball_mesh(rings=24):
     phi = np.linspace(0.0, 2.0 * math.pi, 2 * rings + 1)
     t, p = np.meshgrid(theta, phi, indexing="ij")
     points = np.stack([np.sin(t) * np.sin(p), np.cos(t), np.sin(t) * np.cos(p)], axis=-1)
-    return _sheet(points, points, "ball")
+    return surface_mesh(points, points, "ball")
 
 
 def finite(values):

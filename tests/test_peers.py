@@ -213,7 +213,7 @@ def test_launches_do_not_share_random_numbers(peer, monkeypatch):
     table = TabulatedBRDF.from_model(MODELS["glossy"][0], GRID)
     theirs = their_scene(peer.mi, scene, peer.material(table, *fit_lobe(table)))
     whole = traced(peer, theirs, scene, pixels, 4096, 0)
-    monkeypatch.setattr(peers, "_LAUNCH", 20 * 16)
+    monkeypatch.setattr(peers, "PATHS_AT_ONCE", 20 * 16)
     cut = np.stack([traced(peer, theirs, scene, pixels, 16, seed) for seed in range(64)])
     assert len(np.unique(cut[:, 0, 0])) == 64
     assert reference.relative_error(cut.mean(axis=0), whole) < 0.04

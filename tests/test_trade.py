@@ -11,13 +11,13 @@ from PIL import Image
 
 from traitbrdf.bench import trade
 from traitbrdf.bench.datasets import default_data
-from traitbrdf.bench.trade import _Point, coarser, knee, knot, pareto, vase
+from traitbrdf.bench.trade import TradePoint, coarser, knee, knot, pareto, vase
 from traitbrdf.cli import main
 from traitbrdf.scene.lights import EnvironmentMap
 
 
 def point(milliseconds, error, megabytes=1.0):
-    return _Point(8, "float32", 1.0, milliseconds, megabytes, error, 2.0 * error, 1.0)
+    return TradePoint(8, "float32", 1.0, milliseconds, megabytes, error, 2.0 * error, 1.0)
 
 
 def test_a_front_is_what_nothing_beats():
