@@ -123,7 +123,7 @@ def scores_read(space: TraitSpace, z: Float64, readings: Float64) -> Float64:
 
 
 def difference(before: Float64, after: Float64) -> Float64:
-    """Return the greatest colour difference (...) between `before` and `after` (..., 4, 3), CIELAB."""
+    """Return the greatest colour difference (...) from `before` to `after`, CIELAB (..., 4, 3)."""
     found: Float64 = np.linalg.norm(after - before, axis=-1).max(axis=-1)
     return found
 
@@ -300,7 +300,7 @@ class Composed(NamedTuple):
 
 
 def composed(seed: int, count: int) -> Composed:
-    """Make `count` pairs of random moves a and b, from .1 to .5 and of one sign, by random `seed`."""
+    """Make `count` pairs of random moves a and b, from .1 to .5, of one sign, by `seed`."""
     library, space, rng = default_library(), default_traits(), np.random.default_rng(seed)
     added: list[float] = []
     undone: list[float] = []
@@ -484,7 +484,7 @@ def joined(parts: Iterable[Made]) -> Made:
 
 
 def unrelated_change(moves: Made) -> Float64:
-    """Return the mean |change| (m,) in `moves` of the scores of traits unrelated to the moved one."""
+    """Return the mean |change| (m,) of scores unrelated to the moved traits of `moves`."""
     space = default_traits()
     apart = np.abs(space.related[moves.trait]) < RELATED
     change = np.abs(moves.scores[:, 1] - moves.scores[:, 0])
