@@ -152,7 +152,7 @@ def angle_map(seen: AnglesSeen, height: int = 360) -> NDArray[np.uint8]:
     draw.text((left + height // 2, top + height + 24), "theta_d", fill=(0, 0, 0), anchor="ma")
     draw.text((4, top + height // 2), "theta_h", fill=(0, 0, 0), anchor="lm")
     most = seen.within(0.9)
-    told = f"{100.0 * seen.cells:.0f} % of the angles show; 90 % of the light: theta_h below "
-    told += f"{most[0]:.0f}, theta_d below {most[1]:.0f}"
-    draw.text((4, 4), told, fill=(0, 0, 0))
+    caption = f"{100.0 * seen.cells:.0f} % of the angles show; 90 % of the light: theta_h below "
+    caption += f"{most[0]:.0f}, theta_d below {most[1]:.0f}"
+    draw.text((4, 4), caption, fill=(0, 0, 0))
     return np.asarray(paper)

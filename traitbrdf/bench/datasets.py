@@ -29,7 +29,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 HELD_OUT = 10
-"""One of so many library members is kept out of the training of measured bases."""
+"""Every `HELD_OUT`-th library member is left out of the training of measured bases."""
 
 LEFT_OUT = ("polished-metal", "car-paint", "rubber", "silk", "velvet", "dusty")
 """Families that are left out of training, one at a time."""

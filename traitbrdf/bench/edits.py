@@ -40,7 +40,7 @@ Float64 = NDArray[np.float64]
 
 
 def edit_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Time edits to finished frames, beside the plain sum over environment texels.
+    """Time edits to finished frames, and the plain sum over environment texels.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 PEER_MATERIALS = ("blue-plastic", "gold-polished", "red-rubber")
-"""Members of the library whose edits are timed beside Mitsuba's: glossy, sharp, and dull."""
+"""Library members whose edits are compared with Mitsuba's: glossy, sharp and dull."""
 
 _SEEDS = 16  # frames over which the error of a number of samples is averaged
 _MANY = 16384  # samples per pixel that count as converged

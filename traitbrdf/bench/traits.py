@@ -428,8 +428,8 @@ def made(
     within : bool
         Whether to leave out moves beyond the library's range (`TraitSpace.limits`).
     held : int
-        Hold so many random traits unrelated to the moved one, and nothing else; 0 is the default of
-        the method.
+        Number of random traits to hold, unrelated to the moved one, and nothing else; 0 is the
+        default of the method.
     """
     library, space = default_library(), default_traits()
     z = _point(start)
@@ -817,7 +817,7 @@ def _reach(size: _Size, each: Each, say: Say) -> Iterator[Record]:
     how = "three unrelated traits at a time; greatest |change| of a score, 99th percentile "
     how += f"{np.percentile(own, 99.0):.4f}; read off whole tables {change.max():.3f} and "
     how += f"{np.percentile(change, 99.0):.3f}; {refused.sum()} of "
-    how += f"{len(refused)} moves are refused, for what is held forbids them"
+    how += f"{len(refused)} moves are refused, because what is held forbids them"
     yield Record.at_most("unrelated traits, held", float(own.max()), "", 0.02, how=how)
 
 

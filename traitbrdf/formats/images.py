@@ -25,7 +25,7 @@ _HALF_LIMIT = 65520.0  # numbers from here on round to infinity in half precisio
 
 
 def read_image(path: PathName) -> Float32:
-    """Read a linear OpenEXR or Radiance image, whatever its extension.
+    """Read a linear OpenEXR or Radiance image; the content decides, not the extension.
 
     OpenEXR: the channels R, G, B (or Y alone, repeated) of the first part, half or float, the
     pixels of the data window; alpha is dropped. Radiance: flat and run-length encoded scanlines

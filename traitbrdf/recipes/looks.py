@@ -133,7 +133,7 @@ def rounded(value: float) -> float:
 
 
 def metal(eta: RGB, k: RGB, alpha: float) -> Model:
-    """Return a bare metal; a satin one stands for isotropic brushing.
+    """Return a bare metal; a satin metal serves as an isotropically brushed one.
 
     Parameters
     ----------

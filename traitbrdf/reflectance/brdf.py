@@ -13,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import (
@@ -29,6 +28,9 @@ from traitbrdf.directions import (
 from traitbrdf.formats.brdfs import read_merl, write_merl
 from traitbrdf.formats.files import FormatError, stem
 
+if TYPE_CHECKING:
+    import scipy.sparse
+
 Float64 = NDArray[np.float64]
 
 _Bracket: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Float64]
@@ -40,7 +42,7 @@ class Reflectance(Protocol):
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror (a delta term) beside `eval`."""
+        """Weight (3,) of a perfect mirror (a delta term), in addition to `eval`."""
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Return f_r (..., 3) in 1/sr, without the cosine, for local unit directions.
@@ -281,7 +283,7 @@ class TabulatedBRDF:
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) in [0, 1] of a perfect mirror beside the table."""
+        """Weight (3,) in [0, 1] of a perfect mirror, in addition to the table."""
         return self._mirror
 
     @classmethod
@@ -497,6 +499,8 @@ def albedo_operator(grid: HalfDiffGrid, theta_o: ArrayLike) -> scipy.sparse.csr_
 
 @functools.lru_cache(maxsize=16)
 def _albedo_rows(grid: HalfDiffGrid, angles: tuple[float, ...]) -> scipy.sparse.csr_array:
+    import scipy.sparse  # slow to import, and models and tables do without
+
     nodes = np.unique(np.append(grid.theta_h, math.pi / 2))
     rows = []
     for theta in angles:

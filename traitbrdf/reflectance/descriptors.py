@@ -18,15 +18,17 @@ import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import Array, half_diff_angles
 from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF, albedo_operator
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 Float64 = NDArray[np.float64]
 
@@ -195,6 +197,8 @@ _AT = MappingProxyType({name: i for i, name in enumerate(READINGS)})
 @functools.lru_cache(maxsize=16)
 def reading_rows(grid: HalfDiffGrid) -> scipy.sparse.csr_array:
     """Return sparse rows (len(READINGS), grid.size): times a flat table of `grid`, its readings."""
+    import scipy.sparse  # slow to import, and compiled formulas do without
+
     rows = [albedo_operator(grid, _SEEN_FROM)]
     for angle in (20, 60):
         wi, wo, weight = _receptor(angle)
@@ -210,6 +214,8 @@ def reading_rows(grid: HalfDiffGrid) -> scipy.sparse.csr_array:
 def _row(
     grid: HalfDiffGrid, theta_h: Array, theta_d: Array, phi_d: Array, weight: Float64
 ) -> scipy.sparse.csr_array:
+    import scipy.sparse  # imported late, as in `reading_rows`
+
     index, corner = grid.stencil(theta_h, theta_d, phi_d)
     dense = np.bincount(index.ravel(), (corner * weight[:, None]).ravel(), minlength=grid.size)
     return scipy.sparse.csr_array(np.where(dense > 1e-12, dense, 0.0)[None])

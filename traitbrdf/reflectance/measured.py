@@ -95,7 +95,7 @@ class MeasuredBRDF:
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`: none."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`: none."""
         return np.zeros(3)
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:

@@ -186,7 +186,7 @@ class Model:
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`."""
         return np.zeros(3)
 
     @property
@@ -380,7 +380,7 @@ class PerfectMirror(_Lobe):
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`."""
         return np.array(self.k_s, np.float64)
 
 
@@ -1064,7 +1064,7 @@ class Sum(Model):
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`."""
         return np.asarray(np.sum([part.mirror for part in self.parts], axis=0))
 
     @property
@@ -1107,7 +1107,7 @@ class Scaled(Model):
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`."""
         return np.asarray(self.model.mirror * np.array(self.weight))
 
     @property
