@@ -196,7 +196,12 @@ _AT = MappingProxyType({name: i for i, name in enumerate(READINGS)})
 
 @functools.lru_cache(maxsize=16)
 def reading_rows(grid: HalfDiffGrid) -> scipy.sparse.csr_array:
-    """Return sparse rows (len(READINGS), grid.size): times a flat table of `grid`, its readings."""
+    """Return sparse rows (len(READINGS), grid.size) that turn flat tables into readings.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    """
     import scipy.sparse  # slow to import, and compiled formulas do without
 
     rows = [albedo_operator(grid, _SEEN_FROM)]

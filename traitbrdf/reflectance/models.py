@@ -294,11 +294,12 @@ def _schlick(cos: Float64, r0: Float64) -> Float64:
 class Lambert(Model):
     """Ideal diffuse reflection: f = k_d / pi, k_d the albedo.
 
-    Lambert, "Photometria" (1760). (Ramamoorthi & Hanrahan's k_d drops the pi.)
+    Lambert, "Photometria" (1760). (Ramamoorthi & Hanrahan write f = k_d, without the pi.)
 
     Parameters
     ----------
     k_d : colour
+        Diffuse albedo, in [0, 1].
     """
 
     k_d: RGBLike = 0.5
@@ -331,7 +332,7 @@ class OrenNayar(Model):
     k_d : colour
         Diffuse albedo, in [0, 1].
     sigma : float
-        Standard deviation of the angle of the groove slopes, radians.
+        Standard deviation of the angle of the groove slopes in radians, in [0, pi/2].
     """
 
     k_d: RGBLike = 0.5
@@ -541,11 +542,11 @@ class AshikhminShirley(Model):
     Parameters
     ----------
     r_d : colour
-        Diffuse reflectance of the substrate.
+        Diffuse reflectance of the substrate, in [0, 1].
     r_s : colour
-        Specular reflectance at normal incidence.
+        Specular reflectance at normal incidence, in [0, 1].
     n_u, n_v : float
-        Exponents along the local x and y axes; isotropic where they are equal.
+        Exponents along the local x and y axes, in [1, 1e6]; equal ones make the lobe isotropic.
     """
 
     r_d: RGBLike = 0.5
