@@ -1,4 +1,4 @@
-"""The floors of the house: which room may import which. Adding a room means adding it here."""
+"""The layers of the package: which room may import which. Add new rooms here."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ FLOORS = (
     ("bench", "studio"),
     ("cli",),
 )
-"""Rooms and single modules; each imports only from floors before its own."""
+"""Rooms and single modules; each imports only from earlier floors."""
 
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 LONGEST = 900
 LONGER = {"reflectance/models.py"}
-"""Lines of a file, and files that are a list of many things of one kind."""
+"""Greatest length of a file, and the exception: a list of many things of one kind."""
 
 HOMES = {
     "OpenEXR": {"formats/images.py"},
@@ -42,7 +42,7 @@ HOMES = {
         "transport/kernels.py",
     },
 }  # fmt: skip
-"""Where else's package may be imported."""
+"""Files that may import an outside package."""
 
 
 def module_of(path: Path) -> str:
@@ -51,7 +51,7 @@ def module_of(path: Path) -> str:
 
 
 def imports(source: str, package: str) -> set[str]:
-    """Dotted names of all that is imported anywhere, under TYPE_CHECKING and in functions too.
+    """Dotted names of all imports, including those under TYPE_CHECKING and in functions.
 
     `from a import b` counts as a.b, since b may be a module; `package` resolves relative imports.
     """
@@ -115,14 +115,14 @@ def test_imports_go_down(path):
     assert own in FLOOR, f"add {own} to FLOORS"
     names = house_imports(path) - {own}
     if FLOOR[own] == len(FLOORS) - 1:
-        names -= {""}  # the public names stand above all but the command line
+        names -= {""}  # only the command line may import the public names
     for name in names:
         assert name in FLOOR, f"{own} imports traitbrdf.{name}, which is on no floor"
         assert FLOOR[name] < FLOOR[own], f"{own} imports {name} from its own or a higher floor"
 
 
 def test_imports_within_a_room_make_no_circle():
-    """Files of a room stand one above the other, too."""
+    """The files of a room are layered, too."""
     known = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files()}
     below = {}
     for name, path in known.items():

@@ -1,7 +1,7 @@
-"""traitbrdf: paint traits, not parameters.
+"""Paint material traits on objects and see the result under real light at once.
 
-Materials of a shape's parts are edited by painting or moving traits ("shiny", "metallic") and
-rendered at once under real light; what comes out is a real, tabulated BRDF.
+Edit the materials of a shape's parts by painting or moving traits ("shiny", "metallic"). Each
+result is a tabulated BRDF that can be written to a file.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -67,8 +67,7 @@ __all__ += effects.__all__
 
 
 def __getattr__(name: str) -> Any:
-    """Sessions are loaded when first asked for: torch and the compiled loops take a second, which
-    materials and traits need not wait for."""
+    """Import sessions on first use: torch and the compiled loops take a second to load."""
     if name == "EditSession":
         from traitbrdf.session.editing import EditSession
 
