@@ -44,7 +44,7 @@ class Record:
         ----------
         name, unit : str
         value, target : float
-        more
+        **more
             Other fields of `Record`.
         """
         return cls(name, value, unit, target, bool(value <= target), **more)
@@ -57,7 +57,7 @@ class Record:
         ----------
         name, unit : str
         value, target : float
-        more
+        **more
             Other fields of `Record`.
         """
         return cls(name, value, unit, target, bool(value >= target), **more)

@@ -43,7 +43,7 @@ def bench_scene(environment: EnvironmentMap, size: int | tuple[int, int], **more
     ----------
     environment : EnvironmentMap
     size : int or (height, width)
-    more
+    **more
         Other settings of `Scene`.
     """
     return Scene(teapot(), environment, camera=BENCH_CAMERA, size=size, ground=True, **more)

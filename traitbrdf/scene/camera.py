@@ -72,7 +72,7 @@ class Camera:
         ----------
         azimuth, elevation : float
             Degrees.
-        settings
+        **settings
             The other parameters of `Camera`, by name.
         """
         return cls(azimuth, elevation, **settings)

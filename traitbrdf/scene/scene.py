@@ -232,7 +232,7 @@ class Scene:
 
         Parameters
         ----------
-        settings
+        **settings
             Parameters of the constructor, by name; the others stay.
 
         Raises
