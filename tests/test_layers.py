@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -238,3 +240,19 @@ def test_info_does_not_wait_for_torch():
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_walk_from_the_mouse_to_the_pixel_goes_down():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    section = text.split("## A stroke")[1].split("##")[0]
+    walk = [PACKAGE.parent / name for name in re.findall(r"`(traitbrdf/[\w/.]+)`", section)]
+    assert 5 <= len(walk) <= 8
+    assert all(path.is_file() for path in walk)
+    floors = [FLOOR[module_of(path)] for path in walk]
+    assert floors == sorted(floors, reverse=True)
+    below = {path: imports_of(path) for path in walk if path.suffix == ".py"}
+    for above, path in itertools.pairwise(walk):
+        names = {".".join(above.relative_to(ROOT).with_suffix("").parts)}
+        assert path.suffix != ".py" or not any(
+            name == other or name.startswith(f"{other}.") for name in below[path] for other in names
+        )
