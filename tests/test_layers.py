@@ -250,9 +250,7 @@ def test_the_walk_from_the_mouse_to_the_pixel_goes_down():
     assert all(path.is_file() for path in walk)
     floors = [FLOOR[module_of(path)] for path in walk]
     assert floors == sorted(floors, reverse=True)
-    below = {path: imports_of(path) for path in walk if path.suffix == ".py"}
     for above, path in itertools.pairwise(walk):
-        names = {".".join(above.relative_to(ROOT).with_suffix("").parts)}
-        assert path.suffix != ".py" or not any(
-            name == other or name.startswith(f"{other}.") for name in below[path] for other in names
-        )
+        if path.suffix == ".py":
+            name = ".".join(above.relative_to(ROOT).with_suffix("").parts)
+            assert not any(f"{found}.".startswith(f"{name}.") for found in imports_of(path))
