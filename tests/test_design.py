@@ -14,7 +14,7 @@ from sessions import on, same
 import traitbrdf as tb
 from traitbrdf.design import effects
 from traitbrdf.design.document import Design, Document
-from traitbrdf.design.effects import Applied, Assign, Effect, Move, Palette, blended
+from traitbrdf.design.effects import Applied, Assign, Effect, Move, Palette, Tint, blended
 from traitbrdf.design.layers import Layer
 from traitbrdf.design.masks import Parts
 from traitbrdf.design.strokes import Stroke
@@ -90,10 +90,16 @@ assigned = (
 )
 assignments = st.builds(Assign, assigned)
 
-any_effect = moves | assignments
+factors = st.floats(0.0, 4.0)
+tints = st.builds(
+    Tint,
+    st.tuples(factors, factors, factors) | factors,
+    st.sampled_from(["body", "reflections", "all"]),
+)
+any_effect = moves | assignments | tints
 
 
-@given(moves | st.builds(Assign, st.sampled_from(LIBRARY.names) | closed_forms))
+@given(moves | tints | st.builds(Assign, st.sampled_from(LIBRARY.names) | closed_forms))
 def test_the_repr_of_an_effect_makes_it(effect):
     assert eval(repr(effect), {"tb": tb}) == effect
 
@@ -119,6 +125,11 @@ def test_effects_read_like_calls():
         (lambda: tb.Move({3: 0.1}), TypeError, "names of traits"),
         (lambda: tb.Move(shiny=0.1, hold=3), TypeError, "hold: expected names"),
         (lambda: tb.Move(shiny=0.1, hold=(3,)), TypeError, "hold: expected names"),
+        (lambda: tb.Tint("red"), TypeError, "rgb: expected"),
+        (lambda: tb.Tint((1.0, 0.5)), TypeError, "rgb: expected"),
+        (lambda: tb.Tint((1.0, -0.5, 0.0)), ValueError, "rgb: expected"),
+        (lambda: tb.Tint(math.inf), ValueError, "rgb: expected"),
+        (lambda: tb.Tint(0.5, "highlight"), ValueError, "of: expected"),
         (lambda: tb.Assign(3.0), TypeError, "material: expected"),
         (lambda: tb.Assign(["a"]), TypeError, "coordinates"),
         (lambda: Layer("shiny", Parts.of("body")), TypeError, "effect"),
@@ -145,6 +156,7 @@ def test_no_weight_changes_nothing(kind):
 EXAMPLES: dict[str, Effect] = {
     "Assign": Assign("chrome"),
     "Move": Move(shiny=0.4),
+    "Tint": Tint((1.0, 0.2, 0.1)),
 }
 
 
@@ -165,6 +177,62 @@ def test_a_blend_goes_straight(weight):
         assert found is PLAIN
     else:
         np.testing.assert_allclose(found.offset, weight * chrome.offset, rtol=1e-5, atol=1e-6)
+
+
+members = st.integers(0, len(LIBRARY) - 1).map(
+    lambda i: Material.of_library(LIBRARY.names[i], LIBRARY)
+)
+
+
+def table_of(material):
+    grid = EMBEDDING.grid_
+    return tb.TabulatedBRDF(grid, material.values(EMBEDDING).reshape(*grid.shape, 3))
+
+
+@given(members, tints, st.floats(0.0, 1.0))
+@settings(max_examples=30)
+def test_a_tint_stays_physical(material, tint, weight):
+    found = tint.apply(material, weight, PALETTE).material
+    table = table_of(found)
+    assert np.isfinite(table.values).all() and table.values.min() >= 0.0
+    assert table.max_albedo() <= 1.0 + 1e-3
+    assert np.all((EMBEDDING.low_ <= found.z) & (found.z <= EMBEDDING.high_))
+
+
+@given(members, st.tuples(*[st.floats(0.05, 1.0)] * 3))
+@settings(max_examples=20)
+def test_a_tint_of_all_multiplies_the_albedo(material, rgb):
+    angles = np.radians([0.0, 45.0, 70.0])
+    tinted = table_of(Tint(rgb, "all").apply(material, 1.0, PALETTE).material)
+    expected = table_of(material).albedo(angles) * rgb
+    np.testing.assert_allclose(tinted.albedo(angles), expected, rtol=2e-3, atol=2e-5)
+
+
+def test_a_tint_colours_what_it_is_asked_to():
+    white, gold = (table_of(Material.of_library(n, LIBRARY)) for n in ("white-plastic", "chrome"))
+    body, shine = Tint((1.0, 0.2, 0.1)), Tint((1.0, 0.2, 0.1), "reflections")
+    for name, effect, other, table in (
+        ("white-plastic", body, shine, white), ("chrome", shine, body, gold),
+    ):  # fmt: skip
+        material = Material.of_library(name, LIBRARY)
+        before = table.albedo(np.radians([30.0]))[0]
+        coloured, kept = (
+            table_of(one.apply(material, 1.0, PALETTE).material).albedo(np.radians([30.0]))[0]
+            for one in (effect, other)
+        )
+        # hardly more than the 4 % that a coat reflects stay white
+        np.testing.assert_allclose(coloured / before, (1.0, 0.2, 0.1), atol=0.07)
+        np.testing.assert_allclose(kept / before, 1.0, atol=0.07)
+    peak = np.log(white.values[0, 0, 0])  # the highlight keeps its own colour
+    red = table_of(body.apply(PLAIN, 1.0, PALETTE).material)
+    assert np.ptp(np.log(red.values[0, 0, 0]) - peak) < 0.2
+
+
+def test_scores_know_a_tint():
+    z = Tint((1.0, 0.1, 0.1)).apply(PLAIN, 1.0, PALETTE).material.z
+    before, after = (PALETTE.traits.score(one) for one in (PLAIN.z, z))
+    assert after["red"] > before["red"] + 0.3
+    assert abs(after["shiny"] - before["shiny"]) < 0.1
 
 
 # -- layers and undo --------------------------------------------------------------------------

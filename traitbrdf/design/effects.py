@@ -22,11 +22,12 @@ from traitbrdf.reflectance import models
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
+from traitbrdf.space.logmap import log_map
 from traitbrdf.space.material import Material
 from traitbrdf.space.moves import Moved
 from traitbrdf.space.traits import TraitSpace
 
-__all__ = ["Assign", "Move"]
+__all__ = ["Assign", "Move", "Tint"]
 
 Float32 = NDArray[np.float32]
 
@@ -336,6 +337,76 @@ MODELS = {
 }
 """Closed forms, whose `repr` is Python source (with `tb.models.` before each name)."""
 _MODEL_NAMES = re.compile(rf"\b({'|'.join(sorted(kind.__name__ for kind in MODELS))})(?=\()")
+
+
+@dataclass(frozen=True, repr=False)
+class Tint(Effect):
+    """Multiply a colour: ``tb.Tint((1, 0.2, 0.1))`` makes a white body red.
+
+    Parameters
+    ----------
+    rgb : (3,) array_like or float
+        Linear Rec.709 factors, finite and at least 0.
+    of : "body", "reflections" or "all"
+        The body scatters light in all directions; reflections are what highlights and grazing
+        light add to it. A metal has hardly any body.
+
+    Raises
+    ------
+    ValueError, TypeError
+        On factors that are not finite numbers of at least 0, or another `of`.
+
+    Notes
+    -----
+    f splits into body min(f, b) and reflections f - min(f, b). The level b of the body is read at
+    angles where neither highlight nor grazing light matters. If the result reflects more light
+    than arrives, all of it is divided by its albedo; a perfect mirror beside f is only darkened.
+    """
+
+    rgb: tuple[float, float, float]
+    of: str = "body"
+
+    def __post_init__(self) -> None:
+        try:
+            factors = np.broadcast_to(np.asarray(self.rgb, np.float64), 3)
+        except (TypeError, ValueError):
+            raise TypeError(f"rgb: expected one or three numbers, got {self.rgb!r}") from None
+        if not (np.isfinite(factors).all() and factors.min() >= 0.0):
+            raise ValueError(f"rgb: expected finite factors of at least 0, got {self.rgb!r}")
+        if self.of not in ("body", "reflections", "all"):
+            raise ValueError(f"of: expected 'body', 'reflections' or 'all', got {self.of!r}")
+        object.__setattr__(self, "rgb", tuple(factors.tolist()))
+
+    def apply(self, material: Material, weight: float, palette: Palette) -> Applied:
+        """Multiply by factors that go straight from 1 to `rgb` with the weight."""
+        factors = 1.0 + weight * (np.array(self.rgb) - 1.0)
+        if np.all(factors == 1.0):
+            return Applied(material)
+        embedding = palette.embedding
+        grid, values = embedding.grid_, material.values(embedding)
+        theta_h, theta_d, _ = grid.node_angles()
+        plain = (np.abs(theta_h - _PLAIN_H) < 0.2) & (theta_d < _PLAIN_D)
+        body = np.minimum(values, _BODY * np.median(values[plain.ravel()], axis=0))
+        tinted = {"body": body, "reflections": values - body, "all": values}[self.of]
+        tinted = np.asarray(values + (factors - 1.0) * tinted, np.float32)
+        # coordinates follow as far as the manifold goes, so that scores know the colour; what is
+        # left stands beside them
+        logs = np.stack([np.ascontiguousarray(log_map(f).T) for f in (values, tinted)])
+        before, after = embedding.least_squares(logs)
+        z = embedding.clip(material.z + after - before)
+        table = TabulatedBRDF(grid, np.maximum(tinted, 0.0).reshape(*grid.shape, 3))
+        mirror = (
+            material.mirror if self.of == "body" else np.minimum(material.mirror * factors, 1.0)
+        )
+        offset = embedding.residual(table, z)
+        return Applied(Material(z, mirror, offset, None, material.name))
+
+
+_PLAIN_H, _PLAIN_D = math.radians(55.0), math.radians(40.0)
+"""Around these angles neither highlight nor grazing light matters."""
+
+_BODY = 1.35
+"""The body's level at normal incidence, relative to those angles, where a coat transmits less."""
 
 
 def _stated(model: object) -> bool:
