@@ -35,8 +35,8 @@ from traitbrdf.session.preparation import (
     EXACT_ABOVE,
     LightTrees,
     Prepared,
-    _StopError,
-    _Turns,
+    StoppedError,
+    Turns,
     promised,
     trusted_error,
 )
@@ -1178,7 +1178,7 @@ print(edit.ready, flush=True)
 
 
 def test_turns_are_taken_by_those_who_are_waited_for_first():
-    turns, order = _Turns(), []
+    turns, order = Turns(), []
     behind, urgent = object(), threading.Event()
     turns.take("first", False, lambda: False)
 
@@ -1206,7 +1206,7 @@ def test_turns_are_taken_by_those_who_are_waited_for_first():
     stopped = threading.Event()
     turns.take("first", True, stopped.is_set)
     threading.Timer(0.05, lambda: (stopped.set(), turns.wake())).start()
-    with pytest.raises(_StopError):
+    with pytest.raises(StoppedError):
         turns.take("second", False, stopped.is_set)
 
 

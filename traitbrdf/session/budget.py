@@ -1,9 +1,9 @@
-"""Speed against accuracy: what of a prepared scene a promised error or speed needs.
+"""Speed against accuracy: how many basis images a promised error or speed needs.
 
-A preparation yields more basis images than most looks need. Every image that is left out makes
-frames faster and, for some materials, less exact. How much so is measured here, in this scene and
-on this machine, on materials that the basis was not fitted to; then the fewest images are taken
-with which the error that was asked for is met, or the most with which the speed is.
+A preparation yields more basis images than most views need. Leaving images out makes frames faster
+and, for some materials, less exact. This module measures by how much, in this scene and on this
+machine, on materials that the basis was not fitted to. It then takes the fewest images that meet
+the error asked for, or the most that meet the speed.
 """
 
 from __future__ import annotations
@@ -27,48 +27,59 @@ QUALITIES: dict[str, tuple[int, float]] = {
     "accurate": (144, 1.5),
     "reference": (40, 3.0),
 }
-"""Basis images and resolution of the light for each quality. "reference" shows nothing by its
-basis: every frame is exact, and takes seconds."""
+"""Basis images and resolution of the light for each quality. "reference" does not use its basis:
+every frame is exact, and takes seconds."""
 
 TRUSTED = 0.7
-"""The basis is used where its measured error is at most this share of the error asked for: some
-dozens of probes are a noisy measurement."""
+"""The basis is used where its measured error is at most this share of the error asked for. The
+margin is for noise: the error is measured at some dozens of probes."""
 
 LADDER = (8, 12, 16, 24, 32, 48, 64, 80, 96, 120, 144)
-"""Numbers of basis images that are tried."""
+"""Numbers of basis images to try."""
 
 CASES = 0.95
-"""The share of materials whose frames shall have the error asked for."""
+"""The share of materials whose frames have to meet the error asked for."""
 
 ROUNDING = 0.01
-"""Least error asked for at which float16 may keep the basis: its own is some 0.03 %."""
+"""The basis may be stored in float16 if the error asked for is at least this; rounding alone errs
+by some 0.03 %."""
 
 WORTH = 0.9
-"""The share of a frame's time in float32 that float16 has to stay below to be taken: it halves
-what is read of memory, and has to be widened."""
+"""float16 is taken if a frame needs less than this share of its time in float32. It reads half as
+much memory, but has to be widened."""
 
 RESERVE = 0.75
-"""The share of a frame's time that shading may take: the rest is for the edit, and for hours in
-which a machine is slower."""
+"""The share of a frame's time that shading may take. The rest is for the edit, and a reserve for
+times at which the machine is slower."""
 
 
 @dataclass(frozen=True)
 class Promise:
-    """What was asked of a session, what was picked for it, and what that measured.
+    """What was asked of a session, what was picked for it, and what was measured then.
 
     Attributes
     ----------
-    quality : what the scene was prepared with
-    error, fps : what was asked for; None: nothing
-    basis_images, of : how many are used, of how many that were prepared
-    dtype : what they are kept in
-    resolution : of the light's pieces and of the shadow rays (`quadrature.Operator`)
-    grid, dimensions : nodes of the tables and coordinates of the embedding, which are all used:
-        fewer of them cost more error than they save time (``traitbrdf bench --trade``)
-    error_95 : the error that frames of 95 % of `materials` stay below, by the probes
-    materials : how many it was measured on, none of which the basis was fitted to
-    seconds : a frame of the whole object from an edited material, median
-    kept : whether the measurements are what was asked for
+    quality : str
+        What the scene was prepared with.
+    error, fps : float or None
+        What was asked for.
+    basis_images, of : int
+        Basis images in use, and how many were prepared.
+    dtype : str
+        Number type in which they are stored.
+    resolution : float
+        Of the light tree's cuts and of the shadow rays (`traitbrdf.transport.operator.Operator`).
+    grid, dimensions : (3,) tuple of int, int
+        Nodes of the tables and coordinates of the embedding. All are used: fewer cost more error
+        than they save time (``traitbrdf bench --trade``).
+    error_95 : float
+        Error, measured at the probes, that 95 % of `materials` stay below.
+    materials : int
+        Materials that were measured; the basis was fitted to none of them.
+    seconds : float
+        Median time of a frame of the whole object after an edit.
+    kept : bool
+        Whether the measurements meet what was asked for.
     """
 
     quality: str
@@ -86,11 +97,18 @@ class Promise:
     kept: bool
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the attributes by name."""
         return dict(vars(self))
 
 
 def quality_for(error: float | None) -> str:
-    """The quality whose preparation an error needs, mostly."""
+    """Return the least quality that usually meets an error; None stands for no error asked for.
+
+    Parameters
+    ----------
+    error : float or None
+        Mean relative L1.
+    """
     if error is None:
         return "interactive"
     return "preview" if error >= 0.04 else "interactive" if error >= 0.008 else "accurate"
@@ -106,21 +124,29 @@ def keep(
     error: float | None = None,
     fps: float | None = None,
 ) -> tuple[Transport, Promise]:
-    """The transport with as many basis images as a promise needs.
+    """Return the transport with as many basis images as a promise needs, and the promise.
 
     Parameters
     ----------
-    transport : of all basis images
-    tables : (len(transport.cells), 3, T) float32, materials that it was not fitted to
-    borne : (parts,) the share of the error asked for that each part may have by its measurement
-    frame : makes a frame from an edit, for its time
-    quality, dimensions : what the scene was prepared with, and how many coordinates a material has
-    error, fps : what was asked for; at most one of them
+    transport : Transport
+        With all basis images.
+    tables : (len(transport.cells), 3, T) float32 tensor
+        Materials that the basis was not fitted to.
+    borne : (parts,) float64
+        Error allowed for each part, as a multiple of the error asked for.
+    frame : callable
+        Makes a frame from an edit; it is timed.
+    quality : str
+        What the scene was prepared with.
+    dimensions : int
+        Coordinates of a material.
+    error, fps : float or None
+        What was asked for; at most one of them.
     """
     most = transport.rank_used
     ranks = [rank for rank in LADDER if rank < most] + [most]
     deviation, level = transport.probed(tables, ranks)
-    # of each material the part that is worst off: one that misses is rendered without the basis
+    # the worst part of each material counts: a part that misses is rendered without the basis
     worst = (deviation / np.maximum(level, 1e-30) / borne[:, None]).max(axis=1)
     size = np.array([0 if part is None else len(part.pixels) for part in transport.parts])
     whole = (size @ deviation) / np.maximum(size @ level, 1e-30)
@@ -149,7 +175,14 @@ def keep(
 
 
 def median_seconds(frame: Callable[[Transport], object], transport: Transport) -> float:
-    """Of five frames, after one that does not count."""
+    """Return the median time of five frames, after one to warm up.
+
+    Parameters
+    ----------
+    frame : callable
+        Makes a frame by a transport.
+    transport : Transport
+    """
     frame(transport)
     times = []
     for _ in range(5):

@@ -50,7 +50,7 @@ def _hash(*values: object) -> str:
 
 @functools.lru_cache(maxsize=1)
 def _code() -> str:
-    """A name of what computes: a result must not outlive the code that it came from."""
+    """Return a name of the code that computes: results must not outlive it."""
     try:
         version = importlib.metadata.version("traitbrdf")
     except importlib.metadata.PackageNotFoundError:
@@ -63,7 +63,18 @@ def _code() -> str:
 def cache_key(
     scene: Scene, library: Library, rank: int, resolution: float, seed: int
 ) -> str | None:
-    """A name of all that a preparation depends on; None where that cannot be told."""
+    """Return a name of all that a preparation depends on; None where it cannot be told.
+
+    Parameters
+    ----------
+    scene : Scene
+    library : Library
+    rank : int
+        Basis images.
+    resolution : float
+        Of the light.
+    seed : int
+    """
     shape = scene.shape
     geometry: tuple[object, ...]
     if type(shape) is Mesh:
@@ -71,7 +82,7 @@ def cache_key(
     elif type(shape) is Sphere or not any(scene.casts):
         geometry = ()
     else:
-        return None  # what casts shadows is known to the shape alone
+        return None  # only the shape itself knows what casts shadows
     return _hash(
         _CACHE_FORMAT, _code(), library.embedding.fingerprint(), library.coordinates,
         rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
@@ -84,7 +95,14 @@ def cache_key(
 
 
 def fixed_key(whole: str | None, fixed: Mapping[int, Float32]) -> str | None:
-    """The name of a preparation for the tables of fixed parts, from that of one for all edits."""
+    """Return the name of a preparation in which some parts have fixed tables.
+
+    Parameters
+    ----------
+    whole : str or None
+        Name of the preparation that serves all edits.
+    fixed : mapping of part index to table (cells, 3)
+    """
     if whole is None or not fixed:
         return whole
     return _hash(whole, *(x for pair in fixed.items() for x in pair))
@@ -95,12 +113,16 @@ _SAMPLES = ("normals", "views", "positions", "starts")
 
 
 class Cache:
-    """Finished preparations on disk. A disk that is full, read-only or gone costs nothing but time.
+    """Finished preparations on disk.
+
+    A disk that is full, read-only or missing raises nothing: scenes are prepared anew.
 
     Parameters
     ----------
-    folder : where the files lie; made when the first is written
-    limit : bytes that they may take
+    folder : Path
+        Where the files lie; created at the first write.
+    limit : int
+        Bytes that they may take.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
@@ -109,7 +131,13 @@ class Cache:
 
     @classmethod
     def usual(cls) -> Cache | None:
-        """The one that the environment variables describe; None where there is none."""
+        """Return the cache that the environment variables describe; None where it is off.
+
+        Raises
+        ------
+        ValueError
+            If TRAITBRDF_CACHE_BYTES is no number of bytes.
+        """
         said = os.environ.get("TRAITBRDF_CACHE_BYTES", str(CACHE_BYTES))
         try:
             limit = int(said)
@@ -129,10 +157,11 @@ class Cache:
         return cls(folder, limit) if folder.is_absolute() else None
 
     def file(self, key: str) -> Path:
+        """Return the file of a key."""
         return self.folder / f"{key}.npz"
 
     def read(self, key: str) -> dict[str, NDArray[Any]] | None:
-        """The arrays of a key; None where there are none, or none that are whole."""
+        """Return the arrays of a key; None where they are missing or damaged."""
         path = self.file(key)
         try:
             arrays = read_arrays(path)
@@ -146,14 +175,15 @@ class Cache:
         return arrays
 
     def drop(self, key: str) -> None:
+        """Remove the file of a key, if there is one."""
         with contextlib.suppress(OSError):
             self.file(key).unlink(missing_ok=True)
 
     def write_behind(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Write in a thread of its own, so that the first frame need not wait.
+        """Write in a thread of its own, so that the first frame does not wait.
 
-        The interpreter's end waits for it: a program that shows one frame would else never fill
-        the cache.
+        The interpreter waits for the thread when it ends: otherwise a program that shows one frame
+        would never fill the cache.
         """
         thread = threading.Thread(target=self.write, args=(key, arrays), name="traitbrdf-cache")
         with contextlib.suppress(RuntimeError):  # the interpreter is ending
@@ -171,7 +201,7 @@ class Cache:
             self._trim()
 
     def _trim(self) -> None:
-        """What a cut-off process left half written goes like all others: by its age."""
+        """Remove the least recently used files, half-written ones of killed processes included."""
         found = [(path.stat(), path) for path in self.folder.glob("*.npz")]
         total = sum(stat.st_size for stat, _ in found)
         for stat, path in sorted(found, key=lambda pair: pair[0].st_mtime_ns):

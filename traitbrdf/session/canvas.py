@@ -16,10 +16,23 @@ Int64 = NDArray[np.int64]
 
 
 class Canvas:
-    """The frame on the device, of which only the pixels of changed parts are drawn again.
+    """A frame on the device; only the pixels of changed parts are drawn again.
 
-    A pixel at a border is the sum of the backdrop and its parts, in the order of the parts, each
-    time it is drawn: so the image depends on nothing but the parts' frames.
+    A pixel at a border is the sum of the backdrop and its parts. It is summed anew, in the order of
+    the parts, each time it is drawn, so that the image depends on the parts' frames alone.
+
+    Parameters
+    ----------
+    transport : Transport
+
+    Attributes
+    ----------
+    pixels : (H * W, 3) float32 tensor
+        Linear radiance.
+    drawn : list of PartFrame
+        What it shows of each part.
+    changed : list of int
+        Parts that the last `draw` drew.
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -38,8 +51,13 @@ class Canvas:
         self.changed: list[int] = []
 
     def draw(self, frames: list[PartFrame]) -> None:
-        """Bring the image up to the parts' frames; `changed` are those that were drawn."""
-        drawn, self.drawn = self.drawn, []  # what is cut off half way is drawn as a whole again
+        """Draw the parts' frames; those that are shown already are left alone.
+
+        Parameters
+        ----------
+        frames : list of PartFrame, one for each part
+        """
+        drawn, self.drawn = self.drawn, []  # after an interruption all is drawn again
         if drawn:
             pairs = zip(frames, drawn, strict=True)
             self.changed = [i for i, (new, old) in enumerate(pairs) if new is not old]
@@ -50,7 +68,14 @@ class Canvas:
         self.drawn = frames
 
     def redraw(self, changed: list[int], frames: list[PartFrame]) -> None:
-        """Draw the pixels of the parts `changed`."""
+        """Draw the pixels of some parts.
+
+        Parameters
+        ----------
+        changed : list of int
+            Their indices.
+        frames : list of PartFrame, one for each part
+        """
         for i in changed:
             part = self._transport.parts[i]
             if part is not None:
@@ -63,7 +88,10 @@ class Canvas:
             self.pixels.index_copy_(0, pixels, sums)
 
     def _patch(self, part: int | None) -> tuple[torch.Tensor, list[Any]]:
-        """Pixels that are sums and show `part` (None: any), and what falls on which of them."""
+        """Find the border pixels that show a part (None: any part).
+
+        Returns the pixels and, for each part, its fragments on them and their places there.
+        """
         if part not in self._patches:
             scene = self._transport.scene
             chosen = self._mixed.copy()
@@ -84,19 +112,21 @@ class Canvas:
         return torch.from_numpy(index).to(self._transport.device)
 
     def image(self) -> Float32:
-        """A copy (H, W, 3) of the frame."""
+        """Return a copy (H, W, 3) of the frame."""
         scene = self._transport.scene
         page = self._free.pop() if self._free else _Page((scene.height, scene.width, 3))
         copy = np.asarray(page)
-        # whatever views of it there are hold the array itself: once that is gone, all are
+        # views of the array keep it alive: once it is gone, nobody looks at its memory
         weakref.finalize(copy, _give_back, self._free, page).atexit = False
         copy[...] = self.pixels.cpu().numpy().reshape(copy.shape)
         return copy
 
 
 class _Page:
-    """Memory of a frame. New pages cost ten times the copy: those of a frame that nobody holds any
-    more are used again."""
+    """Memory of a frame.
+
+    Allocating pages costs ten times the copy, so memory of frames that nobody holds is reused.
+    """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._memory = np.empty(shape, np.float32)

@@ -47,26 +47,31 @@ class EditSession(Viewer):
     Parameters
     ----------
     scene : Scene
-    quality, **asked : what is asked for: error, fps, device, seed, cache; see `Settings`
-        A quality of None is what `error` needs, "interactive" without one.
-    library, traits : what to edit with; None is what the package ships
-    progress : called with (stage, fraction) while the scene is prepared, from the thread that
-        prepares; may raise to cancel
-    transport : Transport of this very scene, already prepared; None prepares it when needed
+    quality : str or None
+        See `Settings`. None is what `error` needs, or "interactive" without one.
+    library, traits : Library, TraitSpace
+        What to edit with; None is what the package ships.
+    progress : callable or None
+        Called with (stage, fraction) while the scene is prepared, from the thread that prepares; it
+        may raise to cancel.
+    transport : Transport or None
+        A prepared transport of this very scene; None prepares the scene when needed.
+    **asked
+        What is asked for: error, fps, device, seed, cache; see `Settings`.
 
     Attributes
     ----------
-    settings : Settings, what was asked for
+    settings : Settings
 
     Raises
     ------
     TypeError, ValueError
-        On something that is no scene, the transport of another scene, or as `Settings` does.
+        If `scene` is no Scene, `transport` belongs to another one, or as `Settings` does.
 
     Notes
     -----
-    The scene is prepared at the first `render` (or by `prepare`), behind if asked for; `draft`
-    gives a first image at once. Every method may be called from any thread.
+    The scene is prepared at the first `render`, or by `prepare`, in the background if wanted;
+    `draft` gives a first image at once. Every method may be called from any thread.
     """
 
     def __init__(
@@ -120,25 +125,46 @@ class EditSession(Viewer):
         return self._document.materials
 
     def material(self, part: str) -> Material:
-        """Return the material of a part."""
+        """Return the material of a part.
+
+        Parameters
+        ----------
+        part : str
+            Its name.
+        """
         self.part(part)
         return self.materials[part]
 
     def scores(self, part: str) -> dict[str, float]:
-        """Return every trait's score of a part's material."""
+        """Return every trait's score of a part's material.
+
+        Parameters
+        ----------
+        part : str
+            Its name.
+        """
         return self.traits.score(self.material(part).z)
 
     def brdf(self, part: str) -> TabulatedBRDF:
-        """Return a part's material as a table: ``.write("x.binary")`` saves it."""
+        """Return a part's material as a table; ``.write("x.binary")`` saves it.
+
+        Parameters
+        ----------
+        part : str
+            Its name.
+        """
         material = self.material(part)
         grid = self.embedding.grid_
         values = material.values(self.embedding).reshape(*grid.shape, 3)
         return TabulatedBRDF(grid, values, material.mirror, material.name or part)
 
     def plausibility(self, part: str) -> dict[str, float]:
-        """Return how far a part's material can be believed, as `report` has it.
+        """Return ``energy_scale``, ``gamut_margin`` and ``plausibility`` as `report` has them.
 
-        The names are ``energy_scale``, ``gamut_margin`` and ``plausibility``.
+        Parameters
+        ----------
+        part : str
+            Its name.
         """
         material = self.material(part)
         span = np.maximum(self.embedding.high_ - self.embedding.low_, 1e-12)
@@ -184,11 +210,12 @@ class EditSession(Viewer):
         part : name or names of parts, or a weight in [0, 1] for each
         amounts : mapping of trait to amount
             For traits whose names are no Python identifiers; others may be keywords.
-        hold : what shall stay: traits, "colour", "lightness", "body"; () is nothing
-            None is what `TraitSpace.holds` says: colour, unless a trait is a colour itself, and
-            lightness, unless one is about that.
-        photoreal : whether to stay where materials of the library are near; `plausibility` says
-            how far a material is from that
+        hold : iterable of str, or None
+            What stays constant: traits, "colour", "lightness", "body"; () is nothing. None is
+            `TraitSpace.holds`: colour, unless a trait is a colour itself, and lightness, unless a
+            trait is about it.
+        photoreal : bool
+            Whether to stay near materials of the library; `plausibility` measures that.
         **more : float
             For each trait, how much its score shall change (1: typically low to high).
 
@@ -200,7 +227,8 @@ class EditSession(Viewer):
 
         Notes
         -----
-        Where less is reached, the furthest is shown, and `reached` says how far that is, and why.
+        If the whole amount cannot be reached, the material moves as far as it can; `reached`
+        returns how far that is, and why.
         """
         self.apply(part, Move(amounts, hold=hold, photoreal=photoreal, **more))
 
@@ -295,13 +323,25 @@ class EditSession(Viewer):
             self._edited |= self.design.touched()
 
     def reached(self, part: str) -> Moved | None:
-        """Return what the top layer came to on a part, if it moves traits there; else None."""
+        """Return how far the top layer moved a part's traits; None if it did not move any.
+
+        Parameters
+        ----------
+        part : str
+            Its name.
+        """
         self.part(part)
         applied = self._document.applied.get(part)
         return None if applied is None else applied.moved
 
     def add_trait(self, trait: Trait) -> None:
-        """Paint and move with a trait of one's own; it is saved with the design."""
+        """Add a trait of one's own to paint and move with; it is saved with the design.
+
+        Parameters
+        ----------
+        trait : Trait
+            It replaces a trait of the same name; layers that move that one are applied anew.
+        """
         with self._lock:
             self.traits = self.traits.with_trait(trait, self.library)
 
@@ -370,7 +410,7 @@ class EditSession(Viewer):
 
     def before(self) -> Float32:
         """Return the frame (H, W, 3) as it would be without any layer; nothing is changed."""
-        # a ground that was assigned had another material before
+        # a ground that has a new material had another one before
         self._edited |= {part for layer in self.design.layers for part, _ in layer.mask.weights}
         with self._prepared() as (view, transport):
             materials = [self.design.materials[part] for part in view.scene.parts]
@@ -379,26 +419,26 @@ class EditSession(Viewer):
     # -- reports --------------------------------------------------------------------------------
 
     def report(self) -> dict[str, Any]:
-        """What was measured: error, tier, times, sizes, plausibility; JSON serialisable.
+        """Return what was measured, as a JSON-serialisable dict; render a frame first if needed.
 
-        ``frame_error`` is the mean relative L1 on the probe pixels, which keep their exact
-        rows, over all covered pixels; ``parts`` has it part by part, with the tier, the trait
-        scores of its coordinates, ``energy_scale`` (the factor by which the table had to be
-        lowered to reflect no more than all light: below 1 it shows less of its traits than the
-        scores say), the largest directional albedo and how far the coordinates lie inside the
-        gamut box (0 on its wall, 0.5 in its middle, the least coordinate counts), and the share
-        of the library that is less plausible (``plausibility``). ``move`` says what the last edit
-        asked of a part and what it came to.
+        ``frame_error`` is the mean relative L1 over all covered pixels, measured at the probe
+        pixels, whose exact rows are kept. ``parts`` has for each part
 
-        Tiers: "basis"; "trained", the same after exact images were taken into the part's basis;
-        "exact", without the basis. ``exact_frames`` counts those, ``trained_images`` what the
-        bases have taken in.
+        - its ``error`` and ``tier``: "basis", "trained" (the basis, after exact images were added
+          to it) or "exact" (without the basis),
+        - the trait ``scores`` of its coordinates,
+        - ``energy_scale``, the factor by which the table was lowered to keep its albedo within 1;
+          below 1 it shows less of its traits than the scores say,
+        - ``max_albedo``, the largest directional albedo,
+        - ``gamut_margin``, the distance of the coordinates from the wall of the gamut box: 0 on it,
+          0.5 in the middle; the smallest coordinate counts,
+        - ``plausibility``, the share of the library that is less plausible,
+        - ``move``, what the top layer asked of the part's traits and how far it came.
 
-        ``promise`` is what was picked for the error or the speed that was asked for, and what that
-        measured (`traitbrdf.session.budget.Promise`).
-
-        ``left_out`` is what the frame did not need, and what that saved where it is measured: here
-        and now, both ways. A frame is rendered (and the scene prepared) if that is to be done.
+        ``exact_frames`` counts exact frames, ``trained_images`` the images added to bases.
+        ``promise`` is what was picked for the error or speed asked for, and what was measured then
+        (`traitbrdf.session.budget.Promise`). ``left_out`` is what the frame did not need, and what
+        that saved, measured both ways at this call.
         """
         with self._prepared() as (view, transport):
             materials = [self.materials[part] for part in view.scene.parts]
@@ -428,11 +468,22 @@ class EditSession(Viewer):
     # -- files ----------------------------------------------------------------------------------
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the design (present view and light, layers, own traits) to one file; atomic.
+        """Write the design (present view and light, layers, own traits) to one file, atomically.
 
-        The file holds arrays and JSON only. A loaded design renders the same frame: bit by bit
-        where the parts are shown by the basis as prepared or exactly, within the error asked for
-        where the basis was trained meanwhile. What was undone is not kept.
+        The file holds only arrays and JSON. A loaded design renders the same frame: to the bit
+        where parts are shown exactly or by the basis as prepared, within the error asked for where
+        images were added to the basis. Undone changes are not kept.
+
+        Parameters
+        ----------
+        path : path of the file, usually ``.tbr``
+
+        Raises
+        ------
+        TypeError
+            If the shape is neither a sphere nor a mesh.
+        OSError
+            If the file cannot be written.
         """
         with self._lock:
             scene, document = self.scene, self._document.copy()
@@ -441,21 +492,28 @@ class EditSession(Viewer):
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> EditSession:
-        """Read a design written by `save`; `settings` are passed to `EditSession`.
+        """Read a design written by `save`.
 
-        Designs of formats 1 and 2, from before there were layers, load as the materials that they
-        came to. Those of format 1, from before there were shadows, load without shadows and
-        ground, one ray a pixel.
+        Designs of formats 1 and 2, older than layers, load as the materials that their edits led
+        to. Designs of format 1, older than shadows, load without shadows and ground, one ray a
+        pixel.
+
+        Parameters
+        ----------
+        path : path of the file
+        **settings
+            Passed to `EditSession`, in place of those in the file.
 
         Raises
         ------
-        FileNotFoundError, traitbrdf.formats.files.FormatError
-            Also if the design was made with another embedding than the one at hand: its
-            coordinates would mean other materials.
+        FileNotFoundError
+        traitbrdf.formats.files.FormatError
+            If the file is damaged, or the design was made with another embedding, in which its
+            coordinates mean other materials.
         """
         stored = Stored.read(path)
         with reading(path):
-            Settings(**stored.settings)  # what is wrong in the file is no mistake of the caller
+            Settings(**stored.settings)  # mistakes in the file are not the caller's
         given = dict(stored.settings)
         if stored.traits is not None:
             given["traits"] = stored.traits

@@ -25,7 +25,14 @@ FRAMES_KEPT = 1 << 27
 
 @dataclass(frozen=True)
 class Shown:
-    """One part's shading as it is shown, how it was made, and what that took."""
+    """One part's shading as it is shown.
+
+    Attributes
+    ----------
+    frame : PartFrame
+    tier : how it was made
+    seconds : float, what that took
+    """
 
     frame: PartFrame
     tier: Literal["basis", "trained", "exact"]
@@ -38,7 +45,7 @@ class Shown:
 
 
 class Drafted(NamedTuple):
-    """A draft's image (h, w, 3) and measured error, and of what it is."""
+    """A draft: its image (h, w, 3) and measured error, and what it shows."""
 
     size: int
     materials: tuple[Material, ...]
@@ -48,7 +55,7 @@ class Drafted(NamedTuple):
 
 @dataclass(eq=False)
 class View:
-    """All that belongs to one scene of the session: the next look replaces it as a whole."""
+    """All that is prepared and shown of one scene; the next `look` replaces it as a whole."""
 
     scene: Scene
     job: Preparation | None = None
@@ -66,7 +73,7 @@ class View:
     times: dict[str, float] = field(default_factory=dict)
 
     def keep(self, index: int, material: Material, shown: Shown) -> None:
-        """Keep a part's shading, the least recently used ones going first."""
+        """Keep a part's shading; beyond `FRAMES_KEPT` the least recently used is dropped."""
         old = self.kept.pop((index, material), None)
         self.kept_bytes -= 0 if old is None else old.bytes
         self.kept[index, material] = shown
@@ -77,12 +84,12 @@ class View:
 
 
 def measured(view: View, transport: Transport) -> float:
-    """Error of the frame that was shown last."""
+    """Return the measured error of the frame that was shown last."""
     return transport.frame_error([one.frame for one in view.shown])
 
 
 def enlarged(image: Float32, height: int, width: int) -> Float32:
-    """A copy of an image (h, w, 3) at another size, bilinear between pixel centres."""
+    """Return a copy of an image (h, w, 3) at another size, bilinear between pixel centres."""
     if image.shape[:2] == (height, width):
         return image.copy()
     planes = torch.from_numpy(image).permute(2, 0, 1)[None]

@@ -1,4 +1,4 @@
-"""Preparing a view behind, with progress, and taking turns."""
+"""Preparation of a view: in the background, with progress, one at a time."""
 
 from __future__ import annotations
 
@@ -38,33 +38,33 @@ EXACT_ABOVE = 0.01
 """The error that every shown part has to meet by its own measurement, if none is asked for."""
 
 SMALL_PART = 0.1
-"""Of parts that are a smaller share of the shape's pixels more error is borne, up to three times
-as much: it is lost in the frame's, and an exact frame would take a thousand times as long."""
+"""A part that covers a smaller share of the shape's pixels may err more, up to three times as much:
+the frame's error hardly changes, and an exact frame would take a thousand times as long."""
 
 TRAINED_MEMBERS = 400
-"""Members of the library that a basis is fitted to: more of them span little more."""
+"""Members of the library that a basis is fitted to; more members span little more."""
 
 DRAFT_SIZE = 128
 """Pixels along the longer side of a draft."""
 
 _CALIBRATED = 96
-"""Materials that a promise is measured on."""
+"""Materials on which a promise is measured."""
 
 _STRAY = 0.4
-"""How far half of them are from a member of the library, in widths of the box."""
+"""Distance of half of them from a member of the library, in widths of the gamut box."""
 
-_FAREWELL = 20.0  # seconds that the interpreter's end waits for a cancelled preparation
-
-
-class _StopError(Exception):
-    """Raised through a preparation that was cancelled."""
+_FAREWELL = 20.0  # seconds for which the interpreter, at its end, waits for a preparation
 
 
-class _Turns:
-    """Who computes: heavy work comes one after the other, what somebody waits for first.
+class StoppedError(Exception):
+    """Raised within a preparation that was cancelled."""
 
-    Two at once would only slow each other down, and where numba has no better threading layer its
-    loops must not be entered by two threads.
+
+class Turns:
+    """Lets heavy work run one at a time, urgent work first.
+
+    Two jobs at once would only slow each other down, and some of numba's threading layers do not
+    allow two threads in parallel loops.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,22 @@ class _Turns:
         self._urgent = 0
 
     def take(self, owner: object, urgent: bool, stopped: Callable[[], bool]) -> None:
-        """Wait for a turn; `_StopError` as soon as `stopped()`, looked at upon `wake`."""
+        """Wait for a turn.
+
+        Parameters
+        ----------
+        owner : object
+            Who takes it.
+        urgent : bool
+            Whether somebody waits for the result: urgent work goes first.
+        stopped : callable
+            Whether to give up; it is asked again at each `wake`.
+
+        Raises
+        ------
+        StoppedError
+            As soon as `stopped()` is true.
+        """
         with self._change:
             self._urgent += urgent
             try:
@@ -84,23 +99,24 @@ class _Turns:
                 self._urgent -= urgent
                 self._change.notify_all()
             if stopped():
-                raise _StopError
+                raise StoppedError
             self._owner = owner
 
     def give(self, owner: object) -> None:
-        """End the owner's turn; nothing happens if it has none."""
+        """End the owner's turn, if it has one."""
         with self._change:
             if self._owner is owner:
                 self._owner = None
                 self._change.notify_all()
 
     def wake(self) -> None:
+        """Have all who wait ask again whether they should stop."""
         with self._change:
             self._change.notify_all()
 
     @contextlib.contextmanager
     def urgent(self) -> Iterator[None]:
-        """A turn for what somebody waits for."""
+        """Take an urgent turn for a block of code."""
         owner = object()
         self.take(owner, True, lambda: False)
         try:
@@ -109,11 +125,12 @@ class _Turns:
             self.give(owner)
 
 
-TURNS = _Turns()
+TURNS = Turns()
+"""The turns of this process."""
 
 
 class LightTrees:
-    """The light tree of the map in use; turning a map leaves its tree as it is."""
+    """Keeps the light tree of the map in use; a map that is only rotated has the same tree."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -121,6 +138,7 @@ class LightTrees:
         self._tree: LightTree | None = None
 
     def of(self, environment: EnvironmentMap) -> LightTree:
+        """Return the light tree of a map."""
         with self._lock:
             if self._tree is None or self._image is not environment.image:
                 self._tree, self._image = light_tree(environment), environment.image
@@ -129,8 +147,20 @@ class LightTrees:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A transport, whether it came from the cache, the materials of the parts that it was prepared
-    for no others of (by index), itself before it was cut down for a promise, and the promise."""
+    """A prepared transport.
+
+    Attributes
+    ----------
+    transport : Transport
+        What frames are made with.
+    cached : bool
+        Whether it was read from the cache.
+    fixed : mapping of part index to Material
+        Parts that were prepared for this one material.
+    whole : Transport
+        With all basis images, before some were left out for a promise.
+    promise : Promise or None
+    """
 
     transport: Transport
     cached: bool
@@ -140,15 +170,31 @@ class Prepared:
 
 
 class Preparation:
-    """One run of a view's preparation, in whatever thread calls `run`.
+    """One run of a view's preparation, in the thread that calls `run`.
+
+    Parameters
+    ----------
+    work : callable
+        Prepares; it is given a function to report progress to.
+    publish : callable
+        Is given this object and what was prepared.
+    progress : callable or None
+        Is told of each stage and fraction.
+    wanted : callable
+        Returns None once nobody needs the result.
 
     Attributes
     ----------
-    done : set once it has ended, well or not
-    stopped : whether it was cancelled
-    error : what it failed with
-    fraction : how much is done, never falling
-    thread : where it runs
+    done : threading.Event
+        Set once the run has ended, successfully or not.
+    stopped : bool
+        Whether it was cancelled.
+    error : BaseException or None
+        What it failed with.
+    fraction : float
+        Share that is done; it never falls.
+    thread : threading.Thread or None
+        Where it runs.
     """
 
     def __init__(
@@ -171,20 +217,22 @@ class Preparation:
 
     @property
     def stopped(self) -> bool:
+        """Whether it was cancelled."""
         return self._stop.is_set()
 
     def stop(self) -> None:
-        """End it at its next sign of progress."""
+        """Cancel the run; it ends at its next report of progress."""
         self._stop.set()
         TURNS.wake()
 
     def start(self) -> None:
-        """Run behind. The thread does not keep the interpreter from ending."""
+        """Run in the background, in a thread that does not keep the interpreter from ending."""
         self.thread = threading.Thread(target=self.run, name="traitbrdf-prepare", daemon=True)
         _RUNNING.add(self)
         self.thread.start()
 
     def run(self) -> None:
+        """Prepare and publish; errors are kept in `error`."""
         self.thread = threading.current_thread()
         start = time.perf_counter()
         try:
@@ -195,7 +243,7 @@ class Preparation:
                 TURNS.give(self)
             self.seconds = time.perf_counter() - start
             self._publish(self, prepared)
-        except _StopError:
+        except StoppedError:
             pass
         except BaseException as error:  # also an interruption: whoever waits raises it
             self.error = error
@@ -220,7 +268,7 @@ _RUNNING: weakref.WeakSet[Preparation] = weakref.WeakSet()
 
 @atexit.register
 def _end_preparations() -> None:
-    """Threads that are cut off inside compiled code would take the process down with them."""
+    """Stop what runs: a thread that is killed inside compiled code crashes the process."""
     running = list(_RUNNING)
     for job in running:
         job.stop()
@@ -229,7 +277,16 @@ def _end_preparations() -> None:
 
 
 def trusted_error(scene: Scene, part: int, asked: float | None = None) -> float:
-    """The measured error up to which a session shows a part by the basis."""
+    """Return the measured error up to which a session shows a part by the basis.
+
+    Parameters
+    ----------
+    scene : Scene
+    part : int
+        Index of the part.
+    asked : float or None
+        Error asked for; None is `EXACT_ABOVE`.
+    """
     span = scene.part_slice(part)
     shape = scene.part_slice(len(scene.shape.parts) - 1).stop
     share = max(span.stop - span.start, 1) / max(shape, 1)
@@ -238,7 +295,14 @@ def trusted_error(scene: Scene, part: int, asked: float | None = None) -> float:
 
 
 def timed(call: Callable[[], object], device: torch.device) -> float:
-    """Seconds that a call takes: the least of three."""
+    """Return the least time of three calls, in seconds.
+
+    Parameters
+    ----------
+    call : callable
+    device : torch.device
+        It is synchronised before a time is taken.
+    """
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
@@ -262,8 +326,23 @@ def prepare_view(
     known: Transport | None,
     report: Progress,
 ) -> Prepared:
-    """The transport of a scene, for edits of all parts but those that are `fixed`, as large as a
-    promise of error or speed needs; what is `known` of it need not be computed again."""
+    """Prepare a scene for edits.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : Settings
+        A promise of error or speed decides how many basis images are used.
+    library, traits : Library, TraitSpace
+        What the scene is edited with.
+    cache : Cache or None
+    fixed : mapping of part index to Material
+        Parts that are not edited, and their materials.
+    known : Transport or None
+        An earlier preparation of the scene with fewer parts free; it is extended.
+    report : callable
+        Is told of each stage and fraction.
+    """
     report("compiling", 0.0)
     traits.reach(library.coordinates[0], {traits.names[0]: 0.1})  # else the first stroke waits
     prepared = _transport(scene, settings, library, cache, fixed, known, report)
@@ -274,7 +353,15 @@ def prepare_view(
 
 
 def promised(prepared: Prepared, library: Library, settings: Settings) -> Prepared:
-    """A transport cut down to what a promise of error or speed needs."""
+    """Leave out the basis images that a promise of error or speed does not need.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    library : Library
+        Some of its members are measured.
+    settings : Settings
+    """
     whole = prepared.whole
     scene, device, cells, embedding = whole.scene, whole.device, whole.cells, library.embedding
     used = set(trained_members(library))
@@ -321,7 +408,7 @@ def _transport(
     known: Transport | None,
     report: Progress,
 ) -> Prepared:
-    """The transport of a scene with all images of a quality, computed or read."""
+    """Compute the transport with all basis images of a quality, or read it from the cache."""
     rank, resolution = QUALITIES[settings.quality]
     seed, device = settings.seed, settings.place
     grid = library.embedding.grid_
@@ -355,14 +442,14 @@ def _transport(
 
 
 def trained_members(library: Library) -> list[int]:
-    """Which members of a library bases are fitted to: `TRAINED_MEMBERS` of them, evenly spread."""
+    """Return the indices of `TRAINED_MEMBERS` members, evenly spread, that bases are fitted to."""
     # neighbours of the recipe are of different families: any even choice has them all
     return sorted({int(i) for i in np.linspace(0, len(library) - 1, TRAINED_MEMBERS)})
 
 
 @functools.lru_cache(maxsize=1)
 def training_of(library: Library, seed: int) -> Training:
-    """The training set of a library; kept, since every new view or light needs it again."""
+    """Return the training set of a library; it is kept, since every view and light needs it."""
     channels = [
         library.embedding.decode_values(library.coordinates[i]) for i in trained_members(library)
     ]

@@ -24,7 +24,7 @@ from traitbrdf.transport.transport import PartFrame, Transport
 Float32 = NDArray[np.float32]
 
 TRAINED_IMAGES = 8
-"""At most so many exact images are taken into a basis."""
+"""At most this many exact images are added to a basis."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class Renderer:
 
     Parameters
     ----------
-    embedding : what decodes materials
-    settings : what was asked for
+    embedding : BRDFEmbedding
+        Decodes materials.
+    settings : Settings
     """
 
     embedding: BRDFEmbedding
@@ -47,8 +48,16 @@ class Renderer:
         materials: Sequence[Material],
         exact: bool = True,
     ) -> Float32:
-        """The frame (H, W, 3) of a prepared view with a material for each part; what is shown is
-        kept with the view. Unless `exact`, the basis has the last word."""
+        """Return the frame (H, W, 3) of a prepared view; what is shown is kept with the view.
+
+        Parameters
+        ----------
+        view : View
+        transport : Transport, of the view
+        materials : sequence of Material, one for each part
+        exact : bool
+            Whether parts that the basis shows too inexactly are rendered without it.
+        """
         start = time.perf_counter()
         tables: dict[Material, torch.Tensor] = {}
         wanted = Counter(m for i, m in enumerate(materials) if (i, m) not in view.kept)
@@ -74,8 +83,11 @@ class Renderer:
         alone: bool,
         exact: bool,
     ) -> Shown:
-        """One part's shading; `tables` holds what was decoded for this frame, and `alone` says
-        that only this part wants its material's. Unless `exact`, the basis has the last word."""
+        """Shade one part.
+
+        `tables` holds what was decoded for this frame; `alone` says that no other part needs the
+        same material.
+        """
         known = view.kept.get((index, material))
         if known is not None and not (
             exact and known.tier != "exact" and known.frame.error > self.allowed(view, index)
@@ -102,12 +114,19 @@ class Renderer:
         return shown
 
     def allowed(self, view: View, index: int) -> float:
-        """The measured error up to which a part is shown by the basis."""
+        """Return the measured error up to which a part is shown by the basis.
+
+        Parameters
+        ----------
+        view : View
+        index : int
+            Index of the part.
+        """
         if self.settings.quality == "reference":
             return -1.0
         if self.settings.fps is not None:
             return math.inf
-        # nothing is gained by exact frames that err as much
+        # exact frames gain nothing where they err as much
         allowed = trusted_error(view.scene, index, self.settings.error)
         return max(allowed, view.floor.get(index, 0.0)) if self.settings.error is None else allowed
 
@@ -119,7 +138,7 @@ class Renderer:
         material: Material,
         mirror: torch.Tensor | None,
     ) -> PartFrame:
-        """A part without the basis; its image is taken into the basis for the edits to come."""
+        """Render a part without the basis, and add its image to the basis for later edits."""
         values = material.values(self.embedding)
         part = transport.parts[index]
         with TURNS.urgent():
@@ -128,13 +147,13 @@ class Renderer:
                 view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
             allowed = self.allowed(view, index)
             budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)
-            # where even exact frames miss the error asked for, the basis cannot meet it
+            # if even the exact frame misses the error asked for, the basis cannot meet it
             if part is not None and budget > 0 and frame.error <= allowed:
                 transport.train(index, frame.radiance)
                 table = torch.from_numpy(values[transport.cells]).to(self.settings.place)
                 met = transport.shade(index, table).error <= allowed
                 view.trained[index] = view.trained.get(index, 0) + 1
-                # each image makes all frames slower: few of those that do not help
+                # every image makes all frames slower: take few that do not help
                 view.budget[part.group] = budget - (1 if met else TRAINED_IMAGES // 2)
         view.exact_frames += 1
         if mirror is None or part is None:

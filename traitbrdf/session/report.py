@@ -1,4 +1,4 @@
-"""What was measured of frames, and what they did without."""
+"""Reports: what was measured of frames, and what they could leave out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,16 @@ def view_report(
     embedding: BRDFEmbedding,
     device: torch.device,
 ) -> dict[str, Any]:
-    """What `EditSession.report` says of the frame that a view shows."""
+    """Return what `EditSession.report` says of the frame that a view shows.
+
+    Parameters
+    ----------
+    view : View
+    transport : Transport, of the view
+    materials : sequence of Material, one for each part
+    embedding : BRDFEmbedding
+    device : torch.device, of frames
+    """
     scene, prepared = view.scene, view.prepared
     plain = replace(materials[0], table=None, offset=None)
     promise = None if prepared is None else prepared.promise
@@ -49,7 +58,14 @@ def view_report(
 
 
 def part_report(material: Material, shown: Shown, traits: TraitSpace) -> dict[str, Any]:
-    """What it says of one part."""
+    """Return what `EditSession.report` says of one part.
+
+    Parameters
+    ----------
+    material : Material, of the part
+    shown : Shown
+    traits : TraitSpace
+    """
     return {
         "material": material.name,
         "pixels": len(shown.frame.radiance),
@@ -66,7 +82,7 @@ def _left_out(
     embedding: BRDFEmbedding,
     device: torch.device,
 ) -> dict[str, Any]:
-    """What the last frame did without."""
+    """Return what the last frame could leave out, and what that saved."""
     scene, canvas = view.scene, view.canvas
     if canvas is None:
         return {}
@@ -89,7 +105,7 @@ def _left_out(
             "seconds": timed(lambda: plain.values(embedding, transport.cells), device),
             "seconds_for_all": timed(lambda: plain.values(embedding), device),
         },
-        "edits": {  # that nobody has made: they would need all of the basis images
+        "edits": {  # parts that nobody has edited: edits would need all basis images
             "parts": [scene.parts[i] for i in sorted(transport.fixed)],
             "basis_images": min(
                 (b.rank for b in transport.bases if transport.fixed.intersection(b.parts)),

@@ -1,4 +1,4 @@
-"""What a session is asked for."""
+"""Settings: what a session is asked for."""
 
 from __future__ import annotations
 
@@ -29,22 +29,24 @@ class Settings:
     Parameters
     ----------
     quality : "preview", "interactive", "accurate" or "reference"
-        "reference" shows exact frames alone, which take seconds.
+        "reference" shows only exact frames, which take seconds.
     error : float or None
-        The mean relative L1 that every shown part has to meet by its own measurement (a part
-        smaller than a tenth of the shape up to three times as much); parts that do not are
-        rendered without the basis, which takes seconds, and taught to it. Of the basis as few
-        images are used as 95 % of materials need for it: the more error, the faster. None is
-        0.01, and all images.
+        Mean relative L1 that the measured error of every shown part has to stay below (up to
+        three times as much for parts smaller than a tenth of the shape). A part that does not is
+        rendered without the basis, which takes seconds, and its image is added to the basis. The
+        session uses the fewest basis images with which 95 % of materials meet the error: a larger
+        error is faster. None is 0.01, with all images.
     fps : float or None
-        Frames a second that an edit of the whole object shall reach on this machine: so many
-        images of the basis are used, and no frame is exact. The error that it costs is measured
-        and reported. Not together with `error`.
-    device : torch device for frames
-    seed : int, of the preparation's random choices
+        Frames a second that edits of the whole object have to reach on this machine. The session
+        uses the most basis images that allow it, and no exact frames; it measures and reports the
+        error. Not together with `error`.
+    device : str or torch.device
+        Where frames are computed.
+    seed : int
+        Seed of the preparation's random choices.
     cache : bool
-        Whether finished preparations are kept on disk: in $TRAITBRDF_CACHE or the user's cache
-        folder, the least recently used ones going beyond 2 GB ($TRAITBRDF_CACHE_BYTES; 0 is off).
+        Whether finished preparations are kept on disk, in $TRAITBRDF_CACHE or the user's cache
+        folder. Beyond 2 GB ($TRAITBRDF_CACHE_BYTES; 0 is off) the least recently used are removed.
 
     Raises
     ------
@@ -73,5 +75,5 @@ class Settings:
 
     @property
     def place(self) -> torch.device:
-        """The device, as torch has it."""
+        """The device as a torch.device."""
         return torch.device(self.device)

@@ -1,13 +1,13 @@
-"""A scene shown live: prepared once, then drawn from whatever materials its parts have.
+"""A scene shown live: prepared once, then drawn with the materials that its parts have.
 
-*Views.* Camera, light and size are not part of the materials: `Viewer.look` changes them. All that
-is prepared for one view lies in one object (`View`), which the next look replaces as a whole, so
-that no frame of an old view can turn up later.
+*Views.* Camera, light and size do not belong to the materials: `Viewer.look` changes them. All that
+is prepared for one view lies in one object (`View`). The next look replaces it as a whole, so that
+no frame of an old view can appear later.
 
-*Threads.* A preparation may run behind (`prepare(wait=False)`). It works on what it was given,
-publishes its result in one step under the viewer's lock, and stops at its next sign of progress
-when it is cancelled. Heavy work takes turns (`TURNS`): drafts and exact frames, which somebody
-waits for, go first.
+*Threads.* A preparation may run in the background (`prepare(wait=False)`). It works on what it was
+given, publishes its result in one step under the viewer's lock, and, if it is cancelled, stops at
+its next report of progress. Heavy work takes turns (`TURNS`); drafts and exact frames go first,
+because somebody waits for them.
 """
 
 from __future__ import annotations
@@ -52,26 +52,33 @@ from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
-_TICK = 0.2  # seconds between two looks at how far a preparation has come
+_TICK = 0.2  # seconds between two images of `frames` while a scene is prepared
 
 
 class Viewer:
-    """Frames of a scene whose parts have materials; `EditSession` is one whose materials change.
+    """Prepares and draws a scene; `EditSession` adds materials that change.
 
-    Subclasses say what the parts are made of (`materials`), what materials are made with
-    (`library`, `traits`), and which parts may come to be made of anything (`_edited`).
+    Subclasses provide `materials`, and the `library` and `traits` that they are made with. They add
+    to `_edited` the parts that the preparation has to serve any material of.
 
     Parameters
     ----------
     scene : Scene
-    settings : Settings, what is asked for
-    progress : called with (stage, fraction) while the scene is prepared; may raise to cancel
-    transport : Transport of this very scene, already prepared; None prepares it when needed
+    settings : Settings
+    progress : callable or None
+        Called with (stage, fraction) while the scene is prepared; it may raise to cancel.
+    transport : Transport or None
+        A prepared transport of this very scene; None prepares the scene when needed.
+
+    Attributes
+    ----------
+    settings, progress
+        As given.
 
     Raises
     ------
     TypeError, ValueError
-        On something that is no scene, or the transport of another one.
+        If `scene` is no Scene, or `transport` belongs to another one.
     """
 
     def __init__(
@@ -102,12 +109,12 @@ class Viewer:
 
     @property
     def library(self) -> Library:
-        """What materials are named in and decoded by."""
+        """The library whose members name materials."""
         raise NotImplementedError
 
     @property
     def traits(self) -> TraitSpace:
-        """What materials are moved by."""
+        """The traits that move materials."""
         raise NotImplementedError
 
     @property
@@ -147,11 +154,21 @@ class Viewer:
 
     @property
     def scene(self) -> Scene:
-        """What is looked at; `look` replaces it."""
+        """The scene in view; `look` replaces it."""
         return self._view.scene
 
     def part(self, name: str) -> int:
-        """Index of a part; an unknown name raises ValueError naming the near ones."""
+        """Return the index of a part.
+
+        Parameters
+        ----------
+        name : str
+
+        Raises
+        ------
+        ValueError
+            On an unknown name; the message names similar ones.
+        """
         if name not in self.scene.parts:
             raise ValueError(unknown_name("part", name, self.scene.parts))
         return self.scene.parts.index(name)
@@ -166,18 +183,20 @@ class Viewer:
         size: int | tuple[int, int] | None = None,
         rotation: float | None = None,
     ) -> None:
-        """Change the view or the light; what is None stays. Materials and undo stay as well.
+        """Change the view or the light; what is None stays, and so do materials and undo.
 
-        A preparation that runs is cancelled; the next `render` prepares the new view.
+        A running preparation is cancelled; the next `render` prepares the new view.
 
         Parameters
         ----------
         camera : Camera
         environment : EnvironmentMap
-        lights : the point and directional lights, all of them
+        lights : sequence of PointLight and DirectionalLight
+            All of them.
         size : int or (height, width)
-        rotation : radians
-            Angle by which the map is turned about +y (`EnvironmentMap.rotation`).
+            In pixels.
+        rotation : float
+            Angle in radians by which the map is turned about +y (`EnvironmentMap.rotation`).
 
         Raises
         ------
@@ -216,11 +235,11 @@ class Viewer:
 
     @property
     def ready(self) -> bool:
-        """Whether the present view is prepared: `render` then takes milliseconds."""
+        """Whether the present view is prepared, so that `render` takes milliseconds."""
         return self._serving(self._view) is not None
 
     def _serving(self, view: View) -> Transport | None:
-        """The view's transport, if it is prepared and can show the present materials."""
+        """Return the view's transport if it is prepared for the present materials, else None."""
         known = view.prepared
         if known is None:
             return None
@@ -239,17 +258,18 @@ class Viewer:
     def prepare(self, wait: bool = True) -> Transport | None:
         """Compress the scene's light transport, unless that is done already.
 
-        A ground that nobody edits is prepared for its material alone; the first edit of it has
-        the rest done.
+        A ground that nobody edits is prepared for its present material only; its first edit makes
+        the next `prepare` do the rest.
 
         Parameters
         ----------
         wait : bool
-            False starts the preparation in a thread behind, unless one runs, and returns at once.
+            False starts the preparation in a background thread, unless one runs, and returns.
 
         Returns
         -------
-        The prepared transport; None while it is not ready (only if `wait` is False).
+        Transport or None
+            None while it is not ready (only if `wait` is False).
 
         Raises
         ------
@@ -258,7 +278,7 @@ class Viewer:
         RuntimeError
             If the `progress` callback waits for the preparation that called it.
         Exception
-            What a preparation that ran behind failed with, once; the next call tries again.
+            The error of a background preparation, once; the next call tries again.
         """
         while True:
             with self._lock:
@@ -289,7 +309,7 @@ class Viewer:
                 raise CancelledError("the preparation was cancelled")
 
     def _new_job(self, view: View) -> Preparation:
-        # neither of these holds the session: a session that nobody needs any more can go
+        # neither function holds the session, so that an unused one can be collected
         lock = self._lock
 
         def publish(job: Preparation, prepared: Prepared) -> None:
@@ -311,7 +331,7 @@ class Viewer:
         return Preparation(work, publish, self.progress, weakref.ref(self))
 
     def cancel(self) -> None:
-        """Stop a preparation that runs, soon; the session goes on as if it had not begun."""
+        """Cancel a running preparation, which ends soon; the session goes on as before it."""
         with self._lock:
             job = self._view.job
             if job is not None and not job.done.is_set():
@@ -319,15 +339,15 @@ class Viewer:
                 job.stop()
 
     def draft(self, size: int | None = None) -> tuple[Float32, float]:
-        """A first image at once, without any preparation.
+        """Render a first image at once, without any preparation.
 
-        It is rendered at a small size and enlarged; the first one of a view takes longer than those
-        after it.
+        It is rendered at a small size and enlarged. The first draft of a view takes longer than
+        later ones.
 
         Parameters
         ----------
         size : int
-            Pixels along the longer side of what is rendered; None is 128.
+            Pixels along the longer side at which it is rendered; None is 128.
 
         Returns
         -------
@@ -364,22 +384,29 @@ class Viewer:
         return Drafted(size, materials, image, error)
 
     def render(self, wait: bool = True, exact: bool = True) -> Float32:
-        """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.
+        """Return the frame: linear radiance, backdrop included, never negative.
 
-        Parts whose material is that of a recent frame are not computed again, and
-        only the pixels of those that changed are drawn. The array is the caller's.
+        Parts whose material is that of a recent frame are not computed again, and only the pixels
+        of changed parts are drawn.
 
         Parameters
         ----------
         wait : bool
-            False returns the draft while the view is not prepared, and has it prepared behind.
+            False returns the draft while the view is not prepared, and prepares it in the
+            background.
         exact : bool
-            False shows by the basis what it cannot promise as well, within milliseconds:
-            `doubtful` names those parts then, and `frame_error` has what was measured.
+            False shows every part by the basis, within milliseconds, also where its measured error
+            is larger than asked for: `doubtful` names those parts, and `frame_error` is the error.
+
+        Returns
+        -------
+        (H, W, 3) float32
+            The array is the caller's.
 
         Raises
         ------
-        As `prepare` does.
+        Exception
+            As `prepare` does.
         """
         while not wait:
             with self._lock:
@@ -395,7 +422,7 @@ class Viewer:
 
     @property
     def doubtful(self) -> list[str]:
-        """Parts of the last frame whose measured error is more than the basis is trusted with."""
+        """Parts of the last frame whose measured error is larger than the basis is trusted with."""
         with self._lock:
             view = self._view
             return [
@@ -406,19 +433,27 @@ class Viewer:
 
     @property
     def frame_error(self) -> float | None:
-        """Mean relative L1 of the last frame by its own measurement; None before the first."""
+        """Measured mean relative L1 of the last frame; None before the first."""
         with self._lock:
             view = self._view
             known = view.prepared
             return measured(view, known.transport) if known is not None and view.shown else None
 
     def frames(self) -> Iterator[tuple[Float32, float, float]]:
-        """Images that get better: the draft, then the finished frame.
+        """Yield images that get better: drafts, then the finished frame.
 
-        Yields (image, error, fraction): the image and its error as `draft` has them, again
-        whenever the preparation has come on or a material has changed; at last the frame and its
-        measured error, with a fraction of 1. Closing the generator cancels the preparation, and
-        cancelling the preparation ends the generator.
+        Closing the generator cancels the preparation, and cancelling the preparation ends the
+        generator.
+
+        Yields
+        ------
+        image : (H, W, 3) float32
+            The draft, whenever the preparation has advanced or a material has changed; at last the
+            frame.
+        error : float
+            Measured mean relative L1.
+        fraction : float
+            Share of the preparation that is done; 1 with the frame.
 
         Examples
         --------
@@ -431,7 +466,7 @@ class Viewer:
                 image, error = self.draft()
                 yield image, error, 0.0 if job is None else job.fraction
                 with self._lock:
-                    if self._view is not view:  # what was begun for the old view is void
+                    if self._view is not view:  # the job of the old view is void
                         view, job = self._view, None
                     if job is not None and job.stopped:
                         return
@@ -448,7 +483,7 @@ class Viewer:
 
     @contextlib.contextmanager
     def _prepared(self) -> Iterator[tuple[View, Transport]]:
-        """The lock, held once the present view is ready: never while it is waited for."""
+        """Hold the lock once the present view is prepared, but never while waiting for that."""
         while True:
             self.prepare()
             with self._lock:
@@ -460,7 +495,7 @@ class Viewer:
 
     @property
     def renderer(self) -> Renderer:
-        """What makes the frames of a view, as exact as was asked for."""
+        """Makes the frames of a view, as exact as was asked for."""
         return Renderer(self.embedding, self.settings)
 
     def _frame(self, view: View, transport: Transport, exact: bool = True) -> Float32:
@@ -470,18 +505,26 @@ class Viewer:
     # -- gradients ------------------------------------------------------------------------------
 
     def radiance(self, part: str, z: torch.Tensor) -> torch.Tensor:
-        """A part's linear radiance as a differentiable function of coordinates.
+        """Compute a part's linear radiance as a differentiable function of coordinates.
 
         Parameters
         ----------
-        part : name
+        part : str
+            Name of the part.
         z : (k,) tensor, float32 or float64
+            Coordinates.
 
         Returns
         -------
-        (P, 3) float32 tensor on the session's device: what the part would add to its pixels (see
-        `gradient` for which) if its coordinates were `z`, by the basis and not clamped at 0. What
-        an assigned table has beyond the manifold, and a mirror beside it, stay.
+        (P, 3) float32 tensor on the session's device
+            What the part adds to its pixels (`gradient` returns which) if its coordinates are `z`,
+            by the basis and not clamped at 0. The part of an assigned table that lies beside the
+            manifold, and a mirror, stay.
+
+        Raises
+        ------
+        ValueError
+            On an unknown part.
         """
         index, material = self.part(part), self.materials[part]
         self._edited.add(part)
@@ -495,15 +538,19 @@ class Viewer:
             return shown + mirror * known.mirror
 
     def gradient(self, part: str) -> tuple[Int64, Float32]:
-        """Derivative of the linear frame by a part's coordinates, in closed form.
+        """Differentiate the linear frame by a part's coordinates, in closed form.
+
+        Parameters
+        ----------
+        part : str
+            Name of the part.
 
         Returns
         -------
         pixels : (P,) int64
             Flat indices (row * width + column) of the pixels that show the part.
         slopes : (P, 3, k) float32
-            d radiance / d z of each pixel and colour: of what `radiance` gives at the part's
-            present coordinates.
+            d radiance / d z of each pixel and colour, of `radiance` at the present coordinates.
         """
         index, material = self.part(part), self.materials[part]
         self._edited.add(part)
@@ -516,9 +563,14 @@ class Viewer:
         return pixels, moved.permute(1, 2, 0).contiguous().cpu().numpy()
 
     def angles(self, part: str | None = None) -> AnglesSeen:
-        """Which angles of the BRDF of a part (None: of the shape) this scene shows at all.
+        """Find which angles of a BRDF this scene shows at all.
 
-        What light and view leave out, no edit changes: `traitbrdf.pictures.angle_map` draws it.
+        Edits at other angles change no pixel. `traitbrdf.pictures.angle_map` draws the result.
+
+        Parameters
+        ----------
+        part : str or None
+            Name of a part; None is the whole shape.
         """
         index = None if part is None else self.part(part)
         return angles_seen(self.scene, self.embedding.grid_, index)

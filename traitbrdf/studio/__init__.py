@@ -25,13 +25,13 @@ def need_packages() -> None:
 
 
 def studio(edit: EditSession) -> Canvas:
-    """A live canvas over an edit session, for the last line of a notebook cell.
+    """Return a live canvas over an edit session, for the last line of a notebook cell.
 
     Parameters
     ----------
     edit : EditSession
-        What is painted on. Edits by hand and by code are the same ones: `EditSession.history` has
-        them all, and the canvas shows what cells do.
+        What is painted on. Edits by hand and by code go to the same session: `EditSession.history`
+        has them all, and the canvas shows the edits of other cells.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def studio(edit: EditSession) -> Canvas:
         If the packages of the extra "studio" are not installed.
     """
     need_packages()
-    # a notebook's packages take longer to import than all of this one, and so does torch
+    # torch and a notebook's packages take long to import
     from traitbrdf.session.editing import EditSession
     from traitbrdf.studio.widget import Canvas
 

@@ -1,8 +1,7 @@
 """The live canvas as a page on this machine: `canvas.js` over one WebSocket for each tab.
 
-Any page that a browser shows may open sockets to this machine. So whoever wants the page or the
-socket has to know a token, which is drawn anew for every server, and the socket has to be opened
-by the page itself (its Origin).
+Any page in a browser may open sockets to this machine. So the address of page and socket contains a
+random token, new for every server, and only the page itself may open the socket (its Origin).
 """
 
 from __future__ import annotations
@@ -38,19 +37,30 @@ _HEADERS = {
 
 
 def pack(header: Header, buffers: list[bytes]) -> bytes:
-    """One message of the socket: the header's length (uint32, little endian), the header as JSON
-    in UTF-8, and the buffer."""
+    """Pack one message of the socket.
+
+    It is the header's length (uint32, little endian), the header as JSON in UTF-8, and the buffer.
+
+    Parameters
+    ----------
+    header : dict
+    buffers : list of bytes, at most one
+    """
     text = json.dumps(header, allow_nan=False).encode()
     return b"".join([struct.pack("<I", len(text)), text, *buffers])
 
 
 def unpack(message: bytes) -> tuple[object, list[bytes]]:
-    """Header and buffer of a message.
+    """Unpack header and buffer of a message.
+
+    Parameters
+    ----------
+    message : bytes
 
     Raises
     ------
     ValueError
-        If it is none.
+        If it is no message.
     """
     if len(message) < 4:
         raise ValueError(f"message: expected at least 4 bytes, got {len(message)}")
@@ -66,13 +76,15 @@ def unpack(message: bytes) -> tuple[object, list[bytes]]:
 
 
 def application(session: Session, token: str, origins: Set[str]) -> Starlette:
-    """The page, its modules and its socket.
+    """Make the web application: the page, its modules and its socket.
 
     Parameters
     ----------
     session : Session
-    token : what the page's address and the socket's have to contain as ``?token=``
-    origins : the addresses that the page can have
+    token : str
+        What the addresses of page and socket have to contain as ``?token=``.
+    origins : set of str
+        Addresses that the page can have.
     """
 
     def known(given: str | None) -> bool:
@@ -102,7 +114,7 @@ def application(session: Session, token: str, origins: Set[str]) -> Starlette:
         news: asyncio.Queue[bytes] = asyncio.Queue(maxsize=4)
 
         def offer(message: bytes) -> None:
-            if news.full():  # what a slow page did not take yet is out of date
+            if news.full():  # the oldest news that a slow page did not take is out of date
                 news.get_nowait()
             news.put_nowait(message)
 
@@ -158,25 +170,33 @@ class Server:
     Parameters
     ----------
     session : Session
-    port : 0 takes any that is free
+    port : int
+        0 takes any free port.
 
     Attributes
     ----------
-    url : the page's address, token included
-    socket_url : that of its socket
-    origins : pages that may open it; others may be added
+    url, socket_url : str
+        Addresses of the page and of its socket, with the token.
+    origins : set of str
+        Pages that may open the socket; more may be added.
+    listener : socket.socket
+
+    Raises
+    ------
+    OSError
+        If the port is taken.
     """
 
     def __init__(self, session: Session, port: int = 0) -> None:
         self.session = session
         self.token = secrets.token_urlsafe(24)
-        # named in full, for asyncio lets sockets of TCP alone send small messages at once: else
-        # every frame comes 40 ms late
+        # asyncio turns Nagle's algorithm off only if the protocol is named: otherwise every frame
+        # comes 40 ms late
         self.listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
         try:
             self.listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self.listener.bind(("127.0.0.1", port))
-            self.listener.listen(64)  # who comes before `run` waits
+            self.listener.listen(64)  # connections before `run` wait
         except OSError:
             self.listener.close()
             raise
@@ -197,12 +217,12 @@ class Server:
         )
 
     def run(self) -> None:
-        """Serve until `stop`, or an interruption from the keyboard."""
+        """Serve until `stop` or Ctrl+C."""
         try:
             self._server.run(sockets=[self.listener])
         finally:
             self.listener.close()
 
     def stop(self) -> None:
-        """End `run`, soon; from any thread."""
+        """End `run` soon; any thread may call it."""
         self._server.should_exit = True

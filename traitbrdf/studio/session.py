@@ -1,47 +1,48 @@
-"""The protocol of the live canvas, and the object that speaks it, without any transport.
+"""The protocol of the live canvas and the object that speaks it, independent of the transport.
 
 Every message is a JSON header and at most one binary buffer. The page sends one request and waits
-for its one reply before it sends the next: whatever the pointer did meanwhile goes into that. So no
-queue can grow, and both sides lag by one frame at most.
+for its one reply before it sends the next, which then holds all that the pointer did meanwhile. So
+no queue can grow, and both sides lag by one frame at most.
 
 Up (page to session). All keys but ``kind`` and ``view`` may be missing.
 
 ``{"kind": "hello", "view", "origin"}``
-    Asks for everything: names, sizes, a whole frame. ``origin`` is the page's, if it would rather
-    have a socket: transports that can offer one add its address to the reply, as ``socket``.
+    Asks for everything: names, sizes, a whole frame. ``origin`` is the page's own, if it prefers a
+    socket: transports that can offer one add its address to the reply, as ``socket``.
 ``{"kind": "input", "view", "seq", ...}`` with samples (n, 4) float32: x, y, pressure, phase
     ``seq`` is any number; the reply repeats it. Samples are in pixels of the image; pressure is 0
-    to 1; phase 0 is the pen put down, 1 moved, 2 lifted. Further keys, in the order in which they
-    are obeyed:
+    to 1; in phase 0 the pen goes down, in 1 it moves, in 2 it is lifted. Further keys, in the order
+    in which they are obeyed:
 
-    - ``part``: the part that is chosen; ``pick`` [x, y]: the part to choose is there
-    - ``brush`` {trait, amount, radius, stay}: of the samples; ``stay`` says that only the part on
-      which a stroke begins is painted
+    - ``part``: choose a part by name; ``pick`` [x, y]: choose the part at a pixel
+    - ``brush`` {trait, amount, radius, stay}: brush of the samples; ``stay`` paints only the part
+      on which a stroke begins
     - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
     - ``assign`` {part, material}
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
-      ``dragging`` says that more will follow at once: drafts are smaller, and nothing is prepared
-      until it does not
+      ``dragging`` says that more of these follow at once: drafts are smaller, and preparation waits
+      for the end of the drag
     - ``do``: "undo", "redo"
     - ``save``, ``open``: names of design files in the session's folder
-    - ``before``: show what was there before the first edit
-    - ``exact``: render without the basis what it cannot promise, which takes seconds
-    - ``rest``: the hand rests: a whole frame without loss
-    - ``pad``: make the reply's buffer 66,000 bytes at least, by zeros at its end: sockets of
-      notebook servers keep the end of what is smaller for 40 ms
+    - ``before``: show the frame without any layer
+    - ``exact``: render parts that the basis shows too inexactly without it, which takes seconds
+    - ``rest``: the pointer rests: send the whole frame without loss
+    - ``pad``: pad the reply's buffer with zeros to at least 66,000 bytes, since sockets of notebook
+      servers delay the end of smaller ones by 40 ms
 
 Down (session to page)
 
 ``{"kind": "frame", "view", "seq", "format", "x", "y", "w", "h", "width", "height", "ms", "state",
 "bytes", ...}`` with the pixels that changed: the first ``bytes`` of the buffer
     ``format`` is "jpeg", "png", "rgb" (3 bytes a pixel) or "none" (nothing changed). ``ms`` are
-    milliseconds spent on "edit", "render" and "encode". ``state`` says what is chosen and possible:
-    see `Session._state`. The reply to a hello also has ``parts``, ``traits`` and ``library``.
+    milliseconds spent on "edit", "render" and "encode". ``state`` has the chosen part and what can
+    be done: see `Session._state`. The reply to a hello also has ``parts``, ``traits`` and
+    ``library``.
 ``{"kind": "error", "view", "seq", "message"}``
     The request was not obeyed, or only in part. The session goes on.
 ``{"kind": "changed", "by", "ready", "fraction"}``
-    Pushed to whoever subscribes, ten times a second at most: a view (``by``; "" is several) or the
-    preparation changed the picture; other views ask for it by an empty input when it suits.
+    Pushed to subscribers, at most ten times a second: a view (``by``; "" is several) or the
+    preparation changed the picture. Other views ask for it by an empty input when they want it.
 """
 
 from __future__ import annotations
@@ -72,23 +73,23 @@ Reply = tuple[Header, list[bytes]]
 Push = Callable[[Header, list[bytes]], None]
 
 LARGEST = 1 << 20
-"""Bytes of the largest message that is read."""
+"""Size of the largest message that is accepted, in bytes."""
 _RAW = 200_000
-"""Bytes of a rectangle that is sent as it is: encoding takes longer."""
+"""A rectangle of at most this many bytes is sent as it is, since encoding takes longer."""
 _VIEWS = 32
-"""Views whose last frame is remembered."""
+"""Number of views whose last frame is remembered."""
 _SPACING = 0.03
-"""Samples nearer than this share of the brush's radius to the one before are left out; nearer than
-half a pixel as well."""
+"""A sample is left out if it is nearer to the last one than this share of the brush's radius, or
+than half a pixel."""
 _POINTS = 4096
-"""Points of one stroke; what comes beyond is left out."""
+"""Greatest number of points of one stroke; later ones are left out."""
 _NEWS = 0.1
-"""Seconds in which changes are put together before views are told of them."""
+"""Seconds for which changes are collected before views are told."""
 _TURNING = 64
 """Pixels along the longer side of drafts while the camera or the light is dragged."""
 _PADDED = 66_000
 _CHANGES = {"part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn", "do", "open"}
-"""Keys of requests after which other views may be out of date."""
+"""Keys of requests that may change what other views show."""
 
 
 class Session:
@@ -97,12 +98,23 @@ class Session:
     Parameters
     ----------
     edit : EditSession
-    folder : where designs are saved and opened
-    quality : 1 to 95, of JPEG frames
+    folder : path or None
+        Where designs are saved and opened; None is the working directory.
+    quality : int
+        Of JPEG frames, 1 to 95.
 
     Attributes
     ----------
-    edit : what is shown; opening a design replaces it
+    edit : EditSession
+        The session in view; opening a design replaces it.
+    folder, quality
+        As given.
+    subscribers : dict
+        Callbacks that are told of changes.
+    refiner : threading.Thread or None
+        Prepares the view in the background.
+    display : Display
+        Tone curve of what is sent.
     """
 
     def __init__(
@@ -134,7 +146,14 @@ class Session:
     # -- transports -----------------------------------------------------------------------------
 
     def handle(self, header: object, buffers: Sequence[bytes | memoryview] = ()) -> list[Reply]:
-        """The replies to one message. Never raises: what fails is replied."""
+        """Return the replies to one message; errors become replies and are never raised.
+
+        Parameters
+        ----------
+        header : object
+            The decoded JSON header.
+        buffers : sequence of bytes, at most one
+        """
         view, seq = "", None
         try:
             if not isinstance(header, Mapping):
@@ -151,7 +170,13 @@ class Session:
             return [({"kind": "error", "view": view, "seq": seq, "message": message[:500]}, [])]
 
     def subscribe(self, push: Push) -> Callable[[], None]:
-        """Have `push` called with what changes unasked, from any thread; returns how to end it."""
+        """Have `push` called with unasked changes, from any thread; return a function that ends it.
+
+        Parameters
+        ----------
+        push : callable
+            Takes a header and buffers.
+        """
         key = object()
         with self._lock:
             self.subscribers[key] = push
@@ -163,7 +188,7 @@ class Session:
         return end
 
     def close(self) -> None:
-        """End what runs behind."""
+        """End all background work."""
         with self._lock:
             self._closed = True
             self.subscribers.clear()
@@ -174,7 +199,7 @@ class Session:
             self.refiner.join(10.0)
 
     def still(self) -> bytes:
-        """The present frame as PNG: rendered, or drafted where that would take long."""
+        """Return the present frame as PNG; a draft if the view is not prepared."""
         with self._lock, torch.no_grad():
             edit = self.edit
             image = edit.render(exact=False) if edit.ready else edit.draft()[0]
@@ -197,13 +222,13 @@ class Session:
         dragging, rest = header.get("dragging") is True, header.get("rest") is True
         draft_error = None
         if not ready:
-            # a hand that turns the object wants to see it turn
+            # while the object is turned, speed matters more than detail
             image, draft_error = edit.draft(_TURNING if dragging else None)
         elif header.get("before") is True:
             image = edit.before()
         else:
-            # what the basis cannot promise is shown as it is while the hand moves: its error stands
-            # beside it, and whoever asks for it gets it exactly
+            # while the pointer moves, parts with a larger error than asked for are shown by the
+            # basis, with their error beside them; a request may ask for the exact frame
             image = edit.render(exact=header.get("exact") is True)
         rendered = time.perf_counter()
         reply, pixels = self._encoded(view, image, kind == "hello" or rest, rest)
@@ -239,7 +264,7 @@ class Session:
         return replies
 
     def _act(self, view: str, header: Mapping[str, Any], buffers: Sequence[Any]) -> str:
-        """Obey all of an input that can be obeyed; what failed, in words."""
+        """Obey an input as far as possible; return what failed, in words."""
         failed = []
         for key, act in (
             ("part", self._choose),
@@ -287,7 +312,7 @@ class Session:
         if not np.isfinite(samples).all():
             raise ValueError("expected samples of finite numbers")
         radius, amount = _numbers([brush.get("radius"), brush.get("amount")], 2)
-        # one stroke ends where the next begins, however many lie in one message
+        # one message may hold the end of one stroke and the beginning of the next
         for run in np.split(samples, np.flatnonzero(samples[:, 3] == 0.0)):
             if not len(run):
                 continue
@@ -303,7 +328,7 @@ class Session:
     def _continue(
         self, run: NDArray[np.float64], trait: Any, amount: float, radius: float, stay: bool
     ) -> None:
-        """The stroke so far is one edit: it replaces what it was before."""
+        """Extend the stroke: all of it so far is one layer, which replaces the one before."""
         kept: list[tuple[float, float]] = []
         known = self._stroke
         travelled, pressed, count = self._strength
@@ -333,7 +358,7 @@ class Session:
         parts = parts[parts >= 0]
         if not len(parts):
             return
-        if stay and self._only is None:  # what lies under the pen, or most of the brush
+        if stay and self._only is None:  # the part under the pen, or under most of the brush
             x, y = (math.floor(v) for v in stroke.points[-1])
             inside = 0 <= x < scene.width and 0 <= y < scene.height
             under = int(scene.part_image[y, x]) if inside else -1
@@ -343,7 +368,7 @@ class Session:
         self._part = self._only or self._part
 
     def _take_back(self) -> None:
-        """Undo what the stroke or slider at work did so far, unless something else came since."""
+        """Undo the unfinished stroke or slider, unless another change came since."""
         if self._mine is not None and self.edit.design is self._mine:
             self.edit.undo()
         self._mine = None
@@ -386,7 +411,7 @@ class Session:
         self.edit.look(rotation=self.edit.scene.environment.rotation + math.radians(angle))
 
     def _give_up(self) -> None:
-        """A stroke or a slider does not outlive what it was begun on: what it did stays."""
+        """End the unfinished stroke or slider; what it did stays."""
         self._stroke, self._sliding, self._only = None, False, None
         self._hand, self._mine = None, None
 
@@ -400,7 +425,7 @@ class Session:
             self.edit.redo()
 
     def _file(self, name: object) -> Path:
-        """A design in the folder: what a page says names no other place."""
+        """Return the file of a design; a page can name no other folder."""
         if not isinstance(name, str) or not name or name.startswith("."):
             raise ValueError(f"expected the name of a file, got {name!r}")
         if any(c in name for c in "/\\:\0") or len(name) > 100:
@@ -416,7 +441,7 @@ class Session:
             known = sorted(p.name for p in self.folder.glob("*.tbr"))
             raise ValueError(unknown_name("design", path.name, known))
         old = self.edit
-        # what was promised, and traits of one's own, are the design's
+        # the design has its own promise, and traits of one's own
         self.edit = EditSession.load(path, library=old.library, device=old.device)
         if self.edit.traits is default_traits():
             self.edit.traits = old.traits
@@ -429,11 +454,11 @@ class Session:
     # -- replies --------------------------------------------------------------------------------
 
     def _state(self, view: str, draft_error: float | None) -> Header:
-        """What is chosen and possible: for controls, and for what has to be in view always."""
+        """Return the state that controls show: chosen part, scores, errors, undo and redo."""
         edit = self.edit
         ready = draft_error is None
         told: Header = {}
-        if self._hand != view:  # a hand at work is told once it rests
+        if self._hand != view:  # who drags is told at the end
             known = edit.history
             told = {"edits": len(edit.layers), "history": [_shortened(line) for line in known[-6:]]}
         return {
@@ -452,7 +477,7 @@ class Session:
         }
 
     def _expose(self, image: NDArray[np.float32]) -> None:
-        """Choose the exposure by an image: one while the light stays, so that edits are seen."""
+        """Choose the exposure by an image; it stays while the light does, so that edits show."""
         light = self.edit.scene.environment.image
         if self._light is not light:
             self._light, self.display = light, Display(exposure_of(image))
@@ -461,7 +486,7 @@ class Session:
     def _encoded(
         self, view: str, image: NDArray[np.float32], whole: bool, lossless: bool
     ) -> tuple[Header, bytes]:
-        """What a view does not show yet, as a rectangle."""
+        """Encode the rectangle of pixels that a view does not show yet."""
         height, width = image.shape[:2]
         self._expose(image)
         old = None if whole else self._sent.get(view)
@@ -483,10 +508,10 @@ class Session:
         Image.fromarray(pixels).save(out, "JPEG", quality=self.quality, subsampling=0)
         return {"format": "jpeg", **size}, out.getvalue()
 
-    # -- what happens unasked -------------------------------------------------------------------
+    # -- background work -------------------------------------------------------------------
 
     def _tell(self, by: str) -> None:
-        """Tell soon; what changes until then is told with it."""
+        """Tell subscribers soon; later changes until then are told with this one."""
         with self._lock:
             if self._telling is not None:
                 self._teller = by if by == self._teller else ""
@@ -507,11 +532,11 @@ class Session:
         for push in pushes:
             try:
                 push(dict(news), [])
-            except Exception:  # a view that is gone: its transport ends the subscription
+            except Exception:  # the view is gone: its transport ends the subscription
                 continue
 
     def _refine(self) -> None:
-        """Have the view prepared behind, and tell when it has come on."""
+        """Prepare the view in the background, and tell subscribers of its progress."""
         if self._closed or (self.refiner is not None and self.refiner.is_alive()):
             return
         self._trouble = ""
@@ -520,7 +545,7 @@ class Session:
         self.refiner.start()
 
     def _prepare(self) -> None:
-        """Until what is shown is prepared, or cannot be."""
+        """Prepare until the present view is prepared, or an error ends it."""
         while not self._closed:
             if self._dragging:  # the next view replaces this one at once
                 time.sleep(0.05)
@@ -545,7 +570,7 @@ class Session:
 
 
 def _shortened(line: str) -> str:
-    """A line of the history in which long strokes are told by their number of points."""
+    """Shorten a line of the history: long strokes are told by their number of points."""
     start, _, rest = line.partition("Stroke([")
     points, close, end = rest.partition("], trait=")
     if not close or points.count("(") <= 2:
@@ -554,7 +579,7 @@ def _shortened(line: str) -> str:
 
 
 def _numbers(values: object, count: int) -> list[float]:
-    """Finite numbers of a message."""
+    """Return the finite numbers of a message; raise on anything else."""
     if not isinstance(values, (list, tuple)) or len(values) != count:
         raise ValueError(f"expected {count} numbers, got {values!r}")
     for value in values:
@@ -566,7 +591,7 @@ def _numbers(values: object, count: int) -> list[float]:
 
 
 def _difference(old: NDArray[np.float32], new: NDArray[np.float32]) -> tuple[int, int, int, int]:
-    """Rows and columns within which two images (H, W, 3) differ; none where they do not."""
+    """Return the rows and columns within which two images (H, W, 3) differ, or an empty box."""
     height, width = new.shape[:2]
     if old.shape != new.shape:
         return 0, height, 0, width

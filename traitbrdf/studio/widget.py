@@ -20,11 +20,19 @@ from traitbrdf.studio.session import Session
 
 
 class Canvas(anywidget.AnyWidget):
-    """What `traitbrdf.studio` shows; any number of views of it share one `Session`.
+    """The widget that `traitbrdf.studio` shows; all views of it share one `Session`.
+
+    Parameters
+    ----------
+    edit : EditSession
+    **settings
+        Passed to `anywidget.AnyWidget`.
 
     Attributes
     ----------
     session : Session
+    server : Server or None
+        Gives pages on this machine a socket, once one has asked for it.
     """
 
     _esm = Path(__file__).with_name("canvas.js")
@@ -44,7 +52,7 @@ class Canvas(anywidget.AnyWidget):
             self.send(header, binary)
 
     def _socket(self, origin: object) -> str | None:
-        """The address of a socket for a page that came from this machine, or seems to."""
+        """Return the address of a socket, if the page's address is one of this machine."""
         if not isinstance(origin, str) or len(origin) > 100:
             return None
         if urlsplit(origin).hostname not in ("127.0.0.1", "localhost"):
@@ -59,7 +67,7 @@ class Canvas(anywidget.AnyWidget):
         return self.server.socket_url
 
     def _repr_mimebundle_(self, **settings: Any) -> Any:
-        """The widget, and a still picture for pages that have no kernel."""
+        """Return the widget, and a still picture for pages without a kernel."""
         bundle: Any = super()._repr_mimebundle_(**settings)
         still = {"image/png": self.session.still()}
         if bundle is None:
@@ -69,6 +77,7 @@ class Canvas(anywidget.AnyWidget):
         return {**still, **bundle}
 
     def close(self) -> None:
+        """End the widget, its server and its session."""
         if self.server is not None:
             self.server.stop()
         self.session.close()
