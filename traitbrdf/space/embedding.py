@@ -22,9 +22,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
-import scipy.optimize
-import scipy.sparse
-import scipy.spatial
+import scipy  # its parts are loaded when they are first named
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import fold_phi_d

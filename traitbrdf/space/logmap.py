@@ -7,11 +7,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.optimize
-import scipy.sparse
-import scipy.spatial
+import scipy  # its parts are loaded when they are first named
 from numpy.typing import NDArray
-from scipy.special import sph_harm_y
 
 from traitbrdf.directions import from_half_diff_angles
 from traitbrdf.reflectance.brdf import (
@@ -154,7 +151,8 @@ def natural_light(grid: HalfDiffGrid, order: int = 12, views: int = 8) -> torch.
         # the two halves of azimuths are mirror images, so only the cosine harmonics remain
         harmonics = np.stack(
             [
-                math.sqrt((2.0 if m else 1.0) / (n + 1)) * sph_harm_y(n, m, polar, azimuth).real
+                math.sqrt((2.0 if m else 1.0) / (n + 1))
+                * scipy.special.sph_harm_y(n, m, polar, azimuth).real
                 for n in range(order + 1)
                 for m in range(n + 1)
             ]
