@@ -252,8 +252,6 @@ class Document:
                 f"design: expected parts {list(self.design.materials)}, "
                 f"got {list(design.materials)}"
             )
-        for layer in design.layers:
-            design.check_parts(part for part, _ in layer.mask.weights)
         self._fold(design)
         self._past.append(self.design)
         self._future.clear()
@@ -288,16 +286,15 @@ class Document:
     def _fold(self, design: Design) -> None:
         """Bring `_states` up to a design, from the lowest layer that changed."""
         old, states = self._folded, self._states
-        kept = 0
-        if design.materials is old.materials or design.materials == old.materials:
-            for one, other in zip(design.layers, old.layers, strict=False):
-                if one is not other:
-                    break
-                kept += 1
-            states = states[: kept + 1]
-        else:
-            states = [Folded(dict(design.materials), {})]
+        kept = min(len(design.layers), len(old.layers))
+        if design.materials != old.materials:
+            kept, states = 0, [Folded(dict(design.materials), {})]
+        elif design.layers[:kept] != old.layers[:kept]:
+            pairs = zip(design.layers, old.layers, strict=False)
+            kept = next(i for i, (one, other) in enumerate(pairs) if one != other)
+        states = states[: kept + 1]
         for layer in design.layers[kept:]:
+            design.check_parts(part for part, _ in layer.mask.weights)
             below = states[-1].materials
             applied = {}
             for part, _ in layer.mask.weights:
