@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -14,6 +14,152 @@ _UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
 
 # The loops below are what torch cannot express: tree descents, and sums over lists of uneven
 # length. Numba compiles them; everything that runs while a user paints is torch, on any device.
+
+
+class TreeArrays(NamedTuple):
+    """The light tree as the walk reads it, and the map that the tree was built from.
+
+    Attributes
+    ----------
+    place : (n, 8) float32
+        Unit direction of a node's light, radius in radians, variance; the rest is padding.
+    moment : (n, 12) float32
+        Vector irradiance: x, y, z of red, of green, of blue; the rest is padding.
+    child : (n, 2) int32
+        Indices of the two halves, -1 where there is none, -2 where the node is a leaf.
+    box : (n, 4) int32
+        First row, last row + 1, first column, last column + 1 of a node's texels.
+    image : (rows, columns, 3) float32
+        Radiance of the map's texels.
+    """
+
+    place: Any
+    moment: Any
+    child: Any
+    box: Any
+    image: Any
+
+
+class VisibilityMasks(NamedTuple):
+    """Shared visibility of the nodes of one cut, 64 nodes in a word.
+
+    Attributes
+    ----------
+    first, last : (n,) int32
+        The cut nodes under (or above) a node of the tree are `first` to `last - 1`.
+    hidden, unseen, unhidden : (rows, words) uint64
+        Nodes that are hidden, that are not surely visible, that are not surely hidden.
+    """
+
+    first: Any
+    last: Any
+    hidden: Any
+    unseen: Any
+    unhidden: Any
+
+
+class QuadratureSettings(NamedTuple):
+    """How finely the walk divides the light, and which half vectors it covers.
+
+    Attributes
+    ----------
+    rules : (2, 5) float32
+        Greatest extent of a node relative to its distance from the mirror peak, greatest share of
+        the irradiance, greatest radius at the horizon, greatest radius, and half the width of the
+        narrowest peak. Lengths are in radians. The first row holds for groups that make up their
+        fragment alone, the second for the others.
+    low, high : float32
+        Bounds of sin(theta_h).
+    outline : float32
+        sin(theta_h) up to which leaves at the outline of an occluder cast rays of their own.
+    lobe : float32
+        sin(theta_h) within which the tables hardly change.
+    capacity : int
+        Most leaves of a group.
+    """
+
+    rules: Any
+    low: Any
+    high: Any
+    outline: Any
+    lobe: Any
+    capacity: Any
+
+
+class Questions(NamedTuple):
+    """Shadow rays that a walk asks for, and their answers.
+
+    Attributes
+    ----------
+    ask : (groups, most, 3) float32
+        Directions of the rays, in the map's frame; the walk writes them.
+    answers : (groups, most) uint8
+        1 where light passes.
+    final : bool
+        Whether the answers are known. If not, groups with questions are left out.
+    """
+
+    ask: Any
+    answers: Any
+    final: Any
+
+
+class Tables(NamedTuple):
+    """Scalar tables on a grid of half and difference angles.
+
+    Attributes
+    ----------
+    n_h, n_d, n_p : int
+        Numbers of nodes along theta_h, theta_d and phi_d.
+    values : (n_h * n_d * n_p, T) float32
+        T tables. Without a column (T = 0), rows of the operator are computed, not radiance.
+    """
+
+    n_h: Any
+    n_d: Any
+    n_p: Any
+    values: Any
+
+
+class _Frame(NamedTuple):
+    """What a group of samples shares: mean unit normal and view, mask rows (4,), and the greatest
+    departure of the members' half vectors, in radians."""
+
+    normal: Any
+    viewer: Any
+    mask: Any
+    spread: Any
+
+
+class _Pending(NamedTuple):
+    """Stacks of a walk: nodes and what is known of their visibility, and pieces (n, 6) of texels."""
+
+    stack: Any
+    fates: Any
+    cells: Any
+
+
+class _Sample(NamedTuple):
+    """Unit normal and view of a sample, and its share of the fragment."""
+
+    normal: Any
+    viewer: Any
+    share: Any
+
+
+class _Stencil(NamedTuple):
+    """Where leaves fall in a table: see `_stencils`."""
+
+    cell: Any
+    place: Any
+
+
+class _Row(NamedTuple):
+    """A row of the operator: values (cells, 4), RGB and a filler, and the pairs of theta_h and
+    theta_d that hold something: `touched[0]` lists them, `touched[1]` is 1 at each."""
+
+    values: Any
+    touched: Any
 
 
 @numba.njit(cache=True, nogil=True)
@@ -227,11 +373,8 @@ def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _walk(
-    leaves: Any, ask: Any, answers: Any, n: Any, v: Any, mask: Any,
-    place: Any, moment: Any, child: Any, box: Any, image: Any,
-    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    spread: Any, rule: Any, low: Any, high: Any, outline: Any, lobe: Any,
-    stack: Any, fates: Any, cells: Any,
+    leaves: Any, ask: Any, answers: Any, frame: Any, tree: Any, masks: Any, wanted: Any,
+    pending: Any,
 ) -> Any:  # fmt: skip
     """Leaves of one group into `leaves` (13, n): direction, vector irradiance RGB, variance.
 
@@ -245,6 +388,12 @@ def _walk(
     vectors up to `spread` away from those of `n` and `v`. Returns the number of leaves, the
     capacity if too many, and of questions.
     """
+    n, v, mask, spread = frame.normal, frame.viewer, frame.mask, frame.spread
+    place, moment, child, box, image = tree.place, tree.moment, tree.child, tree.box, tree.image
+    first, last = masks.first, masks.last
+    hidden, unseen, unhidden = masks.hidden, masks.unseen, masks.unhidden
+    rule, low, high, outline, lobe = wanted
+    stack, fates, cells = pending.stack, pending.fates, pending.cells
     relative, brightest, horizon, widest, core = rule[0], rule[1], rule[2], rule[3], rule[4]
     t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
     row_sin = row_cos = column_sin = column_cos = f32(0.0)
@@ -423,16 +572,16 @@ def _arctan(y: Any, x: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _stencils(
-    n: Any, v: Any, leaves: Any, count: Any,
-    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
-) -> None:  # fmt: skip
+def _stencils(sample: Any, leaves: Any, count: Any, tables: Any, stencil: Any) -> None:
     """First cells and interpolation weights of leaves: free of branches, so that it vectorises.
 
     cell (3, n): theta_h and theta_d of the lowest cell of the nearer theta_h sample as one index,
     how many theta_h nodes further the other one starts, and phi_d; place (7, n): fractions along
     theta_h (both samples), theta_d, phi_d, and the irradiance RGB.
     """
+    n, v = sample.normal, sample.viewer
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
+    cell, place = stencil.cell, stencil.place
     n0, n1, n2 = n[0], n[1], n[2]
     v0, v1, v2 = v[0], v[1], v[2]
     half_pi = f32(0.5 * math.pi)
@@ -491,15 +640,16 @@ def _stencils(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _collect(
-    row: Any, touched: Any, found: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
-    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
-) -> Any:  # fmt: skip
-    """Add one sample's leaves to a row (cells, 4), RGB and a filler.
+    whole: Any, found: Any, sample: Any, leaves: Any, count: Any, tables: Any, stencil: Any
+) -> Any:
+    """Add one sample's leaves to a row in which `found` pairs of theta_h and theta_d hold something.
 
-    `touched[0]` lists the `found` pairs of theta_h and theta_d that hold something, `touched[1]`
-    says which these are; returns how many there are now.
+    Returns how many do now.
     """
-    _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
+    _stencils(sample, leaves, count, tables, stencil)
+    row, touched = whole.values, whole.touched
+    share, n_d, n_p = sample.share, tables.n_d, tables.n_p
+    cell, place = stencil.cell, stencil.place
     for q in range(count):
         e0, e1, e2 = share * place[4, q], share * place[5, q], share * place[6, q]
         if e0 + e1 + e2 == f32(0.0):
@@ -534,9 +684,10 @@ def _collect(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _release(out: Any, row: Any, touched: Any, found: Any, n_p: Any, tables: Any) -> None:
+def _release(out: Any, whole: Any, found: Any, shown: Any) -> None:
     """Add a row to `out`: (3, T) its radiance under tables (cells, T), or (3, cells) itself where
     `tables` has no column; then clear it."""
+    row, touched, n_p, tables = whole.values, whole.touched, shown.n_p, shown.values
     for j in range(found):
         i = touched[0, j]
         touched[1, i] = 0
@@ -569,74 +720,74 @@ def _release(out: Any, row: Any, touched: Any, found: Any, n_p: Any, tables: Any
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def one_leaf(
-    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any,
-    n_h: Any, n_d: Any, n_p: Any, tables: Any,
-) -> None:  # fmt: skip
+    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any, tables: Any
+) -> None:
     """Add one leaf (13, 1) a sample: to radiance, or to rows where `tables` has no column."""
     block = 64
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
     for u in numba.prange((len(out) + block - 1) // block):
-        cell = np.empty((3, 1), np.int32)
-        part = np.empty((7, 1), np.float32)
-        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
-        touched = np.zeros((2, n_h * n_d), np.int32)
+        stencil = _Stencil(np.empty((3, 1), np.int32), np.empty((7, 1), np.float32))
+        row = _Row(np.zeros((n_h * n_d * n_p, 4), np.float32), np.zeros((2, n_h * n_d), np.int32))
         for f in range(u * block, min(u * block + block, len(out))):
             found = 0
             for p in range(starts[f], starts[f + 1]):
-                found = _collect(
-                    row, touched, found, normals[p], views[p], share[p], 1, leaves[p],
-                    n_h, n_d, n_p, cell, part,
-                )  # fmt: skip
-            _release(out[f], row, touched, found, n_p, tables)
+                sample = _Sample(normals[p], views[p], share[p])
+                found = _collect(row, found, sample, leaves[p], 1, tables, stencil)
+            _release(out[f], row, found, tables)
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def shade_rows(
-    out: Any, short: Any, ask: Any, asked: Any, answers: Any, final: Any,
-    bundle_start: Any, group_start: Any, target: Any, normals: Any, views: Any, share: Any,
-    middle_normals: Any, middle_views: Any, spread: Any, masks: Any, several: Any,
-    place: Any, moment: Any, child: Any, box: Any, image: Any,
-    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    rules: Any, low: Any, high: Any, outline: Any, lobe: Any, capacity: Any,
-    n_h: Any, n_d: Any, n_p: Any, tables: Any,
+    out: Any, asked: Any, questions: Any, bundles: Any, tree: Any, masks: Any, settings: Any,
+    tables: Any,
 ) -> None:  # fmt: skip
     """Add the leaves of all groups: to radiance, or to rows where `tables` has no column.
 
-    Unless this is the `final` call, groups with questions are left out; groups with more leaves
-    than the capacity always are (`short`).
+    Sets `asked` (groups,) to the number of each group's questions. Unless the answers are final,
+    groups with questions are left out; groups with more leaves than the capacity always are, and
+    `asked` is -1 for them.
     """
+    # arrays that are set in a parallel loop are arguments of their own: numba takes an assignment
+    # to an array of a tuple for dead code
     block = 16
-    bundles = len(bundle_start) - 1
-    for u in numba.prange((bundles + block - 1) // block):
-        stack = np.empty(512, np.int32)
-        fates = np.empty(512, np.int8)
-        cells = np.empty((512, 6), np.float32)
+    count_of = len(bundles.bundle_start) - 1
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
+    capacity, final = settings.capacity, questions.final
+    for u in numba.prange((count_of + block - 1) // block):
+        pending = _Pending(
+            np.empty(512, np.int32), np.empty(512, np.int8), np.empty((512, 6), np.float32)
+        )
         leaves = np.empty((13, capacity), np.float32)
-        cell = np.empty((3, capacity), np.int32)
-        part = np.empty((7, capacity), np.float32)
+        stencil = _Stencil(np.empty((3, capacity), np.int32), np.empty((7, capacity), np.float32))
         # every sample of a fragment goes into one row: its neighbours touch the same cells
-        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
-        touched = np.zeros((2, n_h * n_d), np.int32)
+        row = _Row(np.zeros((n_h * n_d * n_p, 4), np.float32), np.zeros((2, n_h * n_d), np.int32))
         found, current = 0, -1
-        for g in range(bundle_start[u * block], bundle_start[min(u * block + block, bundles)]):
-            count, asked[g] = _walk(
-                leaves, ask[g], answers[g], middle_normals[g], middle_views[g], masks[g],
-                place, moment, child, box, image, first, last, hidden, unseen, unhidden,
-                spread[g], rules[1 if several[g] else 0], low, high, outline, lobe,
-                stack, fates, cells,
+        first = bundles.bundle_start[u * block]
+        last = bundles.bundle_start[min(u * block + block, count_of)]
+        for g in range(first, last):
+            frame = _Frame(
+                bundles.middle_normals[g], bundles.middle_views[g], bundles.masks[g],
+                bundles.spread[g],
             )  # fmt: skip
+            wanted = (
+                settings.rules[1 if bundles.several[g] else 0],
+                settings.low, settings.high, settings.outline, settings.lobe,
+            )  # fmt: skip
+            count, rays = _walk(
+                leaves, questions.ask[g], questions.answers[g], frame, tree, masks, wanted, pending
+            )
+            asked[g] = -1 if count == capacity else rays
             if count == capacity:
-                short[g] = True
                 continue
-            if asked[g] > 0 and not final:
+            if rays > 0 and not final:
                 continue
-            for p in range(group_start[g], group_start[g + 1]):
-                if target[p] != current and found > 0:
-                    _release(out[current], row, touched, found, n_p, tables)
+            for p in range(bundles.group_start[g], bundles.group_start[g + 1]):
+                target = bundles.target[p]
+                if target != current and found > 0:
+                    _release(out[current], row, found, tables)
                     found = 0
-                current = target[p]
-                found = _collect(
-                    row, touched, found, normals[p], views[p], share[p], count, leaves,
-                    n_h, n_d, n_p, cell, part,
-                )  # fmt: skip
+                current = target
+                sample = _Sample(bundles.normals[p], bundles.views[p], bundles.share[p])
+                found = _collect(row, found, sample, leaves, count, tables, stencil)
         if found > 0:
-            _release(out[current], row, touched, found, n_p, tables)
+            _release(out[current], row, found, tables)

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,16 @@ from traitbrdf.directions import reflect
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.lights import EnvironmentMap, turn_about_y
 from traitbrdf.scene.scene import Scene
-from traitbrdf.transport.kernels import interpolate_masks, one_leaf, shade_rows
+from traitbrdf.transport.kernels import (
+    QuadratureSettings,
+    Questions,
+    Tables,
+    TreeArrays,
+    VisibilityMasks,
+    interpolate_masks,
+    one_leaf,
+    shade_rows,
+)
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.visibility import (
     Bundles,
@@ -82,13 +91,38 @@ CORE = 3e-3
 SHARPEST = 1e-4
 """The same for the narrowest peaks that a table holds."""
 
-_ALL = (-1.0, 9.0)
-
 _SHARED = ((4, 0.002), (2, 0.007))
 """Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
 
 _UNITED = 0.007
 """The same for the samples of one fragment."""
+
+
+class _Lobes(NamedTuple):
+    """Which lobes leaves have to resolve.
+
+    Attributes
+    ----------
+    window : theta_h in radians of the light that is added, from and to
+    width : radians
+        No leaves are finer than lobes of this width need.
+    core : radians, or None for the operator's
+        No leaves at a mirror peak are wider than peaks of twice this width bear.
+    exact : whether leaves are as fine as sharp lobes need at silhouettes
+    """
+
+    window: tuple[float, float] = (-1.0, 9.0)
+    width: float = 0.0
+    core: float | None = None
+    exact: bool = False
+
+
+class _Light(NamedTuple):
+    """What the walk reads beside the samples."""
+
+    tree: TreeArrays
+    masks: VisibilityMasks
+    settings: QuadratureSettings
 
 
 class Operator:
@@ -131,8 +165,7 @@ class Operator:
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
             tree = LightTree.build(environment)
         self.tree = tree
-        self._nodes = self.tree.packed
-        self._image = environment.image
+        self._nodes = TreeArrays(*self.tree.packed, environment.image)
         scale = 1.0 / resolution
         # sharp lobes are lost where the leaves at their peaks grow wider than these
         rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
@@ -162,7 +195,7 @@ class Operator:
         """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._shade(out, at, self._mask_rows(at), _Lobes(), _NO_TABLES)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -183,7 +216,7 @@ class Operator:
             place[at[mine] - span.start] = mine
             everything = np.arange(span.start, span.stop)
             masks = self._plan(part).mask_rows
-            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
+            self._shade(out, everything, masks, _Lobes(), _NO_TABLES, place=place)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
@@ -192,7 +225,7 @@ class Operator:
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=self._core_of(tables))
+        self._shade(out, at, self._mask_rows(at), _Lobes(core=self._core_of(tables)), tables)
         self._add_lights(out, at, tables)
         return out
 
@@ -240,27 +273,29 @@ class Operator:
         broad = lobe >= high  # nothing is near
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
+            lobes = _Lobes(width=lobe, core=self._core_of(tables), exact=True)
             self._shade(
-                out, index, plan.mask_rows, _ALL, tables,
-                lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
-                core=self._core_of(tables),
+                out, index, plan.mask_rows, lobes, tables,
+                lambda fraction: report("exact images", fraction),
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
         near = np.repeat(_near_window(self.grid, low, high), self.grid.size // self.grid.shape[0])
-        wide, far = (tables, _ALL) if broad else (tables * (1.0 - near)[:, None], (low, 9.0))
+        wide, far = tables, _Lobes(width=lobe)
+        if not broad:
+            wide, far = tables * (1.0 - near)[:, None], _Lobes((low, 9.0), lobe)
         coarse = np.zeros((len(plan.computed), 3, tables.shape[1]), np.float32)
         computed = index[plan.computed]
         self._shade(
             coarse, computed, self._own_rows(computed), far, wide,
-            lambda fraction: report("far images", fraction), lobe=lobe,
+            lambda fraction: report("far images", fraction),
         )  # fmt: skip
         out = np.empty((len(index), 3, tables.shape[1]), np.float32)
         interpolate_masks(out, coarse, plan.corners, plan.weights)
         if not broad:
             self._shade(
-                out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
-                lambda fraction: report("near images", fraction), lobe=lobe,
+                out, index, plan.mask_rows, _Lobes((-1.0, high), lobe), tables * near[:, None],
+                lambda fraction: report("near images", fraction),
             )  # fmt: skip
         self._add_lights(out, index, tables)
         return out
@@ -334,50 +369,50 @@ class Operator:
             first_rows(group_start, masks), several,
         )  # fmt: skip
 
-    def _light(
-        self, window: tuple[float, float], exact: bool, lobe: float, core: float
-    ) -> tuple[Any, ...]:
-        """What the walk needs beside the samples: nodes, masks and rules."""
-        low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
-        cut, masks = _NO_CUT, _NO_MASKS
+    def _light(self, lobes: _Lobes) -> _Light:
+        """Return the nodes, masks and settings of a walk that resolves some lobes."""
+        low, high = lobes.window
+        low, high = math.sin(max(low, -0.5)), math.sin(min(high, 0.5 * math.pi))
+        masks = _NO_MASKS
         if self._visibility is not None:
-            cut = (self._visibility.cut.first, self._visibility.cut.last)
-            masks = self._visibility.masks
+            cut = self._visibility.cut
+            masks = VisibilityMasks(cut.first, cut.last, *self._visibility.masks)
+        exact = lobes.exact or self.resolution > 1.0
+        core = self.core if lobes.core is None else lobes.core
         rules = np.concatenate(
             [self._exact_rules if exact else self._rules, np.full((2, 1), core, np.float32)], axis=1
         )
-        return (
-            *self._nodes, self._image, *cut, *masks, rules,
-            f32(low), f32(high if high < 1.0 else 9.0),
-            f32(math.sin(_OUTLINE) if lobe <= _SPLIT[1] else -9.0), f32(math.sin(lobe)),
+        settings = QuadratureSettings(
+            rules, f32(low), f32(high if high < 1.0 else 9.0),
+            f32(math.sin(_OUTLINE) if lobes.width <= _SPLIT[1] else -9.0),
+            f32(math.sin(lobes.width)), self._capacity,
         )  # fmt: skip
+        return _Light(self._nodes, masks, settings)
 
     def _shade(
         self,
         out: Float32,
         index: Int64,
         mask_rows: NDArray[np.int32],
-        window: tuple[float, float],
+        lobes: _Lobes,
         tables: Float32,
         report: Callable[[float], None] = lambda fraction: None,
         place: Int64 | None = None,
-        exact: bool = False,
-        lobe: float = 0.0,
-        core: float | None = None,
     ) -> None:
-        """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
-        `tables` (cells, T), or to their rows if there are no tables.
+        """Add light to the fragments `index`.
 
-        `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
-        `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
-        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, and `core`
-        (this operator's if left out) none that are wider at the peak than peaks of twice that width
-        bear.
+        Parameters
+        ----------
+        out : (m, 3, T) radiance under the tables, or (m, 3, cells) rows if there are no tables
+        index : (m,) fragments
+        mask_rows : (m, 4) visibility rows that surround each fragment, -1 for none
+        lobes : which leaves are taken
+        tables : (cells, T)
+        report : called with the fraction done
+        place : (m,) where in `out` each fragment is; those of -1 are left out
         """
         step = 1 << 13
-        light = self._light(
-            window, exact or self.resolution > 1.0, lobe, self.core if core is None else core
-        )
+        light = self._light(lobes)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
@@ -388,53 +423,41 @@ class Operator:
             self._shade_all(target, bundles, light, tables)
             report(at.stop / len(index))
 
-    def _shade_all(
-        self, out: Float32, bundles: Bundles, light: tuple[Any, ...], tables: Float32
-    ) -> None:
-        """Shade bundles, those again that have more leaves than there was room for."""
-        capacity = self._capacity
+    def _shade_all(self, out: Float32, bundles: Bundles, light: _Light, tables: Float32) -> None:
+        """Shade bundles; repeat with twice the room those that have more leaves than it holds."""
+        settings = light.settings._replace(capacity=self._capacity)
         while len(bundles.several):
-            bundles = bundles.take(self._shade_some(out, bundles, light, tables, capacity))
-            capacity *= 2
+            light = light._replace(settings=settings)
+            bundles = bundles.take(self._shade_some(out, bundles, light, tables))
+            settings = settings._replace(capacity=2 * settings.capacity)
 
     def _shade_some(
-        self,
-        out: Float32,
-        bundles: Bundles,
-        light: tuple[Any, ...],
-        tables: Float32,
-        capacity: int,
+        self, out: Float32, bundles: Bundles, light: _Light, tables: Float32
     ) -> NDArray[np.bool_]:
-        """Shade bundles; returns which groups have more leaves than the capacity."""
+        """Shade bundles, and return which groups have more leaves than the capacity."""
         groups = len(bundles.several)
-        short = np.zeros(groups, np.bool_)
+        shown = Tables(*self.grid.shape, tables)
         asked = np.zeros(groups, np.int64)
         ask = np.empty((groups, _QUESTIONS, 3), np.float32)
-        answers = np.ones((groups, _QUESTIONS), np.uint8)
-        rest = (capacity, *self.grid.shape, tables)
-        shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
-            out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
-        )  # fmt: skip
-        again = (asked > 0) & ~short
+        unanswered = Questions(ask, np.ones((groups, _QUESTIONS), np.uint8), False)
+        shade_rows(out, asked, unanswered, bundles, *light, shown)
+        again = asked > 0
         # where rays decide, pixels do not share them
         shared = again & (np.diff(bundles.group_start) > 1)
         again &= ~shared
         if shared.any():
-            apart = bundles.take(shared).separated()
-            self._shade_all(out, apart, light, tables)
+            self._shade_all(out, bundles.take(shared).separated(), light, tables)
         if again.any():
             local, which = questions(ask[again], asked[again])
             toward = turn_about_y(local, self.scene.environment.rotation)
             some = bundles.take(again)
-            answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
+            count = len(some.several)
+            answers = np.ones((count, _QUESTIONS), np.uint8)
             asker = some.sample[some.group_start[:-1]]
             answers[which] = self.scene.visible(asker[which[0]], toward)
-            count = len(some.several)
-            shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
-                out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
-                *some.for_the_walk(), *light, *rest,
-            )  # fmt: skip
-        return short
+            final = Questions(ask[:count], answers, True)
+            shade_rows(out, np.zeros(count, np.int64), final, some, *light, shown)
+        return asked < 0
 
     def _add_lights(self, out: Float32, index: Int64, tables: Float32) -> None:
         """Add the point and directional lights, each one leaf a sample."""
@@ -453,7 +476,7 @@ class Operator:
                 starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
                 one_leaf(
                     out[at], starts, self._normals[sample], self._views[sample],
-                    share.astype(np.float32), leaves, *self.grid.shape, tables,
+                    share.astype(np.float32), leaves, Tables(*self.grid.shape, tables),
                 )  # fmt: skip
 
     # -- visibility -----------------------------------------------------------------------------
@@ -546,5 +569,6 @@ def _core(grid: HalfDiffGrid, tables: Float32) -> float:
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
-_NO_CUT = (np.zeros(1, np.int32), np.zeros(1, np.int32))
-_NO_MASKS = tuple(np.zeros((1, 1), np.uint64) for _ in range(3))
+_NO_MASKS = VisibilityMasks(
+    *(np.zeros(1, np.int32) for _ in range(2)), *(np.zeros((1, 1), np.uint64) for _ in range(3))
+)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,58 +83,68 @@ class VisibilityCut:
         return cls(first, last, directions, flux[cut] / total, neighbours)
 
 
-@dataclass(frozen=True)
-class Bundles:
+class Bundles(NamedTuple):
     """Samples in groups that share one walk, and groups in bundles that one thread shades.
 
-    `target` says which fragment a sample belongs to: all its samples are in one bundle.
+    All samples of a fragment are in one bundle.
+
+    Attributes
+    ----------
+    bundle_start : (B + 1,) int64, where bundles start among the groups
+    group_start : (G + 1,) int64, where groups start among the samples
+    target : (n,) int64, the fragment that each sample belongs to
+    normals, views : (n, 3) float32 unit vectors in the map's frame
+    share : (n,) float32, of each sample in its fragment
+    sample : (n,) int64, indices of the samples in the scene
+    middle_normals, middle_views : (G, 3) float32, means of the groups
+    spread : (G,) float32
+        How far half vectors against the normals differ within each group, in radians.
+    masks : (G, 4) int32 visibility rows, -1 for none
+    several : (G,) bool, whether the fragment has other groups
     """
 
-    bundle_start: Int64  # (B + 1,) into groups
-    group_start: Int64  # (G + 1,) into samples
-    target: Int64  # (n,)
-    normals: Float32  # (n, 3)
-    views: Float32  # (n, 3)
-    share: Float32  # (n,)
-    sample: Int64  # (n,) in the scene
-    middle_normals: Float32  # (G, 3)
-    middle_views: Float32  # (G, 3)
-    spread: Float32  # (G,) how far half vectors against the normals differ within the group
-    masks: NDArray[np.int32]  # (G, 4)
-    several: NDArray[np.bool_]  # (G,) whether the fragment has other groups
-
-    _PER_SAMPLE: ClassVar = ("normals", "views", "share", "sample")
-
-    def for_the_walk(self) -> tuple[Any, ...]:
-        return (
-            self.bundle_start, self.group_start, self.target, self.normals, self.views, self.share,
-            self.middle_normals, self.middle_views, self.spread, self.masks, self.several,
-        )  # fmt: skip
+    bundle_start: Int64
+    group_start: Int64
+    target: Int64
+    normals: Float32
+    views: Float32
+    share: Float32
+    sample: Int64
+    middle_normals: Float32
+    middle_views: Float32
+    spread: Float32
+    masks: NDArray[np.int32]
+    several: NDArray[np.bool_]
 
     def of(self, place: Int64) -> Bundles:
-        """The samples of some fragments alone, in their groups; `place` renumbers the fragments,
-        and those of -1 are left out."""
+        """Return the samples of some fragments alone, in their groups.
+
+        Parameters
+        ----------
+        place : (fragments,) int64
+            The new number of each fragment; those of -1 are left out.
+        """
         target = place[self.target]
-        left = np.concatenate([[0], np.cumsum(target >= 0)])[self.group_start]
-        kept = replace(
-            self, group_start=left, target=target[target >= 0],
-            **{name: getattr(self, name)[target >= 0] for name in self._PER_SAMPLE},
-        )  # fmt: skip
-        return kept.take(np.diff(left) > 0)
+        kept = target >= 0
+        left = np.concatenate([[0], np.cumsum(kept)])[self.group_start]
+        return self._replace(
+            group_start=left, target=target[kept], normals=self.normals[kept],
+            views=self.views[kept], share=self.share[kept], sample=self.sample[kept],
+        ).take(np.diff(left) > 0)  # fmt: skip
 
     def separated(self) -> Bundles:
-        """Each sample in a group of its own."""
+        """Return each sample in a group of its own."""
         size = np.diff(self.group_start)
         starts = np.arange(len(self.target) + 1)
-        return replace(
-            self, bundle_start=self.group_start[self.bundle_start], group_start=starts,
+        return self._replace(
+            bundle_start=self.group_start[self.bundle_start], group_start=starts,
             middle_normals=self.normals, middle_views=self.views,
             spread=np.zeros(len(self.target), np.float32),
             masks=np.repeat(self.masks, size, axis=0), several=np.repeat(self.several, size),
         )  # fmt: skip
 
     def take(self, groups: NDArray[np.bool_]) -> Bundles:
-        """These groups alone."""
+        """Return the groups of a mask (G,) alone."""
         kept = np.flatnonzero(groups)
         samples, group_start = expand(self.group_start, kept)
         bundle = np.repeat(np.arange(len(self.bundle_start) - 1), np.diff(self.bundle_start))[kept]
