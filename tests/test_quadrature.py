@@ -20,7 +20,7 @@ from traitbrdf.scene.teapot import teapot
 from traitbrdf.space.embedding import GRID
 from traitbrdf.space.library import default_library
 from traitbrdf.transport.lighttree import LightTree
-from traitbrdf.transport.operator import _FLAT, Operator, _core, _lobe
+from traitbrdf.transport.operator import FLAT, Operator, core_of, lobe_of
 from traitbrdf.transport.visibility import VisibilityCut
 
 LIBRARY = default_library()
@@ -330,14 +330,14 @@ def test_samples_at_borders_have_shadows_of_their_own():
     assert np.median(found[1]) < 0.006
     # without them all samples see what the middle one does
     blind = Operator(scene, GRID, 2.0)
-    blind._visibility.cast_samples = lambda index, fine: None
+    blind.visibility.cast_samples = lambda index, fine: None
     assert np.median(errors(by_images(blind, index, TABLES), true)) > 2.0 * np.median(found[1])
 
 
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_how_fragments_are_grouped_does_not_show(make):
     scene = make()
-    core = _core(GRID, channels(TABLES))
+    core = core_of(GRID, channels(TABLES))
     operator = Operator(scene, GRID, core=core)
     index = some(scene, 40)
     shuffled = np.random.default_rng(2).permutation(len(index))
@@ -350,7 +350,7 @@ def test_how_fragments_are_grouped_does_not_show(make):
     parts = [by_images(anew, few, TABLES) for few in np.split(index, [1, 8, 31])]
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-5, atol=1e-6 * level)
     np.testing.assert_allclose(by_rows(anew, index, TABLES), whole, rtol=1e-3, atol=1e-5 * level)
-    operator._capacity = 40  # too small for any fragment: enlarged as often as need be
+    operator.capacity = 40  # too small for any fragment: enlarged as often as need be
     np.testing.assert_allclose(
         by_images(operator, index, TABLES), whole, rtol=1e-5, atol=1e-6 * level
     )
@@ -386,11 +386,11 @@ def test_images_of_whole_parts(shadows):
 def test_rows_as_shown_are_those_of_the_images(make):
     """With the same shadows and walks, whatever is asked for beside: a basis is fitted to them."""
     scene = make()
-    operator = Operator(scene, GRID, core=_core(GRID, channels(TABLES)))
+    operator = Operator(scene, GRID, core=core_of(GRID, channels(TABLES)))
     index = some(scene, 60)
     rows = operator.rows_as_shown(index)
     found = np.einsum("mck,kt->mct", rows, channels(TABLES), optimize=True)
-    operator._exact_rules = operator._rules  # far images uninterpolated, but of the same leaves
+    operator.exact_rules = operator.rules  # far images uninterpolated, but of the same leaves
     images = [
         operator.part_images(part, channels(TABLES), interpolate=False)
         for part in range(len(scene.parts))
@@ -435,7 +435,7 @@ def test_preparing_is_done_once_and_told():
     # every sample of a border counts; some of them get all rays, of the others few
     count = np.diff(scene.offsets)[scene.pixel_part == 1].sum()
     # neighbours see nearly the same: far fewer than one ray for each direction and sample
-    assert cast < 0.5 * 0.5 * count * len(operator._visibility.cut.share)
+    assert cast < 0.5 * 0.5 * count * len(operator.visibility.cut.share)
     operator.prepare(1)
     assert scene.rays_cast == cast
 
@@ -669,19 +669,19 @@ def test_lobes_as_wide_as_their_tables_are(small_sphere):
     angles = GRID.theta_h[:, None, None, None]
     for width in (0.05, 0.2):
         inside = 2.0 - np.clip(angles - width, 0.0, 1.0) + np.zeros((*GRID.shape, 1))
-        found = _lobe(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
+        found = lobe_of(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
         # within it they change by no more than is allowed
-        assert width <= found <= width + 1.2 * _FLAT * 2.0
-    assert _lobe(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
+        assert width <= found <= width + 1.2 * FLAT * 2.0
+    assert lobe_of(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
     noise = np.random.default_rng(0).random((GRID.size, 2), dtype=np.float32)
-    assert _lobe(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
+    assert lobe_of(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
 
 
 def test_what_views_never_see_does_not_narrow_lobes():
     table = np.ones((*GRID.shape, 1), np.float32)
     table[:3, GRID.theta_d > 1.4] = 100.0
-    assert _lobe(GRID, table.reshape(-1, 1), 1.5) < 0.01
-    assert _lobe(GRID, table.reshape(-1, 1), 0.9) > 1.5
+    assert lobe_of(GRID, table.reshape(-1, 1), 1.5) < 0.01
+    assert lobe_of(GRID, table.reshape(-1, 1), 0.9) > 1.5
 
 
 def test_wide_lobes_have_far_images_alone():
@@ -704,4 +704,4 @@ def test_flat_parts_interpolate_narrower_lobes():
     operator = Operator(ball_on_ground(96), GRID)
     operator.prepare(0)
     operator.prepare(1)
-    assert operator._plans[1].scale < operator._plans[0].scale <= 1.0
+    assert operator.plan(1).scale < operator.plan(0).scale <= 1.0

@@ -273,11 +273,11 @@ def test_texels_at_the_poles_are_not_lost_at_the_horizon(row):
 
 
 def refined(environment, normals, views, models, resolution=0.05):
-    evaluate = reference._Evaluator(models)
-    texels = reference._Cells.texels(environment.image)
+    evaluate = reference.Evaluator(models)
+    texels = reference.Cells.texels(environment.image)
     return np.array(
         [
-            reference._integrate(texels, n, v, evaluate, resolution)
+            reference.integrate(texels, n, v, evaluate, resolution)
             for n, v in zip(normals, views, strict=True)
         ]
     )
@@ -295,7 +295,7 @@ def test_stated_error_contains_the_truth(monkeypatch, seed):
     ]
     normals, views = points(2, seed=seed)
     values, error = reference.radiance(normals, views, models, environment, tolerance=1e-4)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    monkeypatch.setattr(reference, "MAX_CELLS", 10_000_000)
     truth = refined(environment, normals, views, models)
     assert np.all(np.abs(values - truth) <= error)
     assert np.all(error.max(-1) <= 1e-4 * values.max(-1))
@@ -408,25 +408,26 @@ def finer_runs(rng, tolerance, monkeypatch):
     environment = random_light(rng)
     normal, view = random_view(rng)
     brdfs = [random_brdf(rng) for _ in range(3)]
-    visible, cell = None, 0.1
+    visible, shadows, cell = None, None, 0.1
     if rng.random() < 0.2:
         axis, bound = rng.normal(size=3), rng.uniform(-0.5, 0.9)
         axis /= np.linalg.norm(axis)
         visible = lambda point, w: w @ axis < bound  # noqa: E731
+        shadows = reference.Shadows(visible, cell)
     groups = [[brdf] for brdf in brdfs] if rng.random() < 0.4 else [brdfs]
     results, resolutions = [], []
-    integrate = reference._integrate
+    integrate = reference.integrate
 
     def watched(*args):
         resolutions.append(args[4])
         return integrate(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(reference, "_integrate", watched)
+        patch.setattr(reference, "integrate", watched)
         for group in groups:
             try:
                 values, error = reference.radiance(
-                    normal, view, group, environment, (), None, tolerance, visible, cell
+                    normal, view, group, environment, (), None, tolerance, shadows
                 )
             except reference.IntegrationError:
                 yield "refused", None, None
@@ -436,15 +437,15 @@ def finer_runs(rng, tolerance, monkeypatch):
     if not results:
         return
     if visible is None:
-        cells = reference._Cells.texels(environment.image)
+        cells = reference.Cells.texels(environment.image)
     else:
-        cells = reference._Pieces(environment, cell).seen(0, normal[0], visible)
+        cells = reference.Pieces(environment, cell).seen(0, normal[0], visible)
     n, v = (np.asarray(environment.to_map(w[0]), np.float64) for w in (normal, view))
     allowed = np.array([0.05 * error.max() for _, _, error, _ in results])
     truth = finer.settled(cells, n, v, [brdf for brdf, *_ in results], allowed)
     for (brdf, value, error, last), true in zip(results, truth, strict=True):
         if np.isnan(true).any():
-            evaluate = reference._Evaluator([brdf])
+            evaluate = reference.Evaluator([brdf])
             run = integrate(cells, n, v, evaluate, last / 3.3)
             true = np.full(3, np.nan) if run is None else run[0]
         kind = "table" if isinstance(brdf, TabulatedBRDF) else type(brdf).__name__
@@ -489,7 +490,7 @@ def test_a_grazing_view_meets_the_tolerance(monkeypatch):
     views = cos * normals + math.sqrt(1 - cos * cos) * across / np.linalg.norm(across)
     environment, models = random_map(), [GGX(alpha=0.1), Lambert(0.5)]
     values, error = reference.radiance(normals, views, models, environment)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    monkeypatch.setattr(reference, "MAX_CELLS", 10_000_000)
     truth = refined(environment, normals, views, models, 0.08)
     assert np.all(np.abs(values - truth) <= error)
 
@@ -505,14 +506,14 @@ def test_a_looser_tolerance_is_met_and_stated():
 
 def test_refuses_rather_than_lies(monkeypatch):
     normals, views = points(2)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 500)
+    monkeypatch.setattr(reference, "MAX_CELLS", 500)
     with pytest.raises(reference.IntegrationError, match="point 0: more than 500 cells needed"):
         reference.radiance(normals, views, [GGX(alpha=0.01)], random_map())
 
 
 def test_refuses_what_no_mesh_resolves(monkeypatch):
     """A reflectance that is noise never converges: it must end, and in a refusal."""
-    monkeypatch.setattr(reference, "_MAX_CELLS", 40_000)
+    monkeypatch.setattr(reference, "MAX_CELLS", 40_000)
     rng = np.random.default_rng(0)
     noise = types.SimpleNamespace(eval=lambda wi, wo: rng.random(wi.shape), mirror=np.zeros(3))
     normals, views = points(1)
@@ -678,7 +679,7 @@ def test_hidden_texels_are_as_good_as_black(angle):
         assert point.shape == w.shape[:1]
         return turn_about_y(w, -angle)[:, 0] > 0.0
 
-    shaded, error = reference.radiance(normals, views, models, environment, visible=visible)
+    shaded, error = reference.radiance(normals, views, models, environment, shadows=reference.Shadows(visible))
     black, _ = reference.radiance(normals, views, models, EnvironmentMap(image, angle))
     np.testing.assert_allclose(shaded, black, rtol=1e-6)
     assert np.all(error.max(-1) <= 1e-4 * shaded.max(-1))
@@ -689,11 +690,13 @@ def test_nothing_hidden_is_no_shadow():
     normals, views = points(3)
     free, _ = reference.radiance(normals, views, models, environment)
     seen, _ = reference.radiance(
-        normals, views, models, environment, visible=lambda point, w: np.ones(len(w), bool)
+        normals, views, models, environment,
+        shadows=reference.Shadows(lambda point, w: np.ones(len(w), bool)),
     )
     np.testing.assert_allclose(seen, free, rtol=1e-6)
     dark, error = reference.radiance(
-        normals, views, models, environment, visible=lambda point, w: np.zeros(len(w), bool)
+        normals, views, models, environment,
+        shadows=reference.Shadows(lambda point, w: np.zeros(len(w), bool)),
     )
     np.testing.assert_array_equal(dark, 0.0)
     np.testing.assert_array_equal(error, 0.0)
@@ -710,7 +713,7 @@ def test_rays_go_only_where_light_may_come_from():
         return np.ones(len(w), bool)
 
     environment = EnvironmentMap(image, 0.4)
-    reference.radiance(normals, views, [Lambert(1.0)], environment, visible=visible)
+    reference.radiance(normals, views, [Lambert(1.0)], environment, shadows=reference.Shadows(visible))
     point, w = (np.concatenate(both) for both in zip(*asked, strict=True))
     assert np.all(environment.radiance(w) > 0.0)
     assert np.all(cosine(normals[point], w) > -0.02)
@@ -784,7 +787,8 @@ def test_nothing_is_asked_where_nothing_can_fall(monkeypatch):
 def test_pieces_need_a_size(cell):
     normals, views = points(1)
     with pytest.raises(ValueError, match="shadow_cell: expected an angle above 0 radians, got"):
-        reference.radiance(normals, views, [Lambert()], random_map(), shadow_cell=cell)
+        shadows = reference.Shadows(lambda point, w: np.ones(len(w), bool), cell)
+        reference.radiance(normals, views, [Lambert()], random_map(), shadows=shadows)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -812,7 +816,7 @@ def test_a_fragment_is_the_sum_of_its_samples(lit_scene):
             models,
             scene.environment,
             [scene.arriving(light, rows) for light in scene.lights],
-            visible=lambda point, w, rows=rows: scene.visible(rows[point], w),
+            shadows=reference.Shadows(lambda point, w, rows=rows: scene.visible(rows[point], w)),
         )
         # of the four samples of its pixel, those that hit the part
         np.testing.assert_allclose(value, each.sum(axis=0) / 4.0, rtol=1e-6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,9 +69,8 @@ def relative(frame, exact):
 
 def copied(built):
     """An equal transport whose training leaves the other alone."""
-    again = Transport.restored(built.scene, GRID, built.arrays())
-    again._operator = built._operator  # the rays are cast once
-    return again
+    # with the same operator, so that rays are cast once
+    return Transport.restored(built.scene, GRID, built.arrays(), operator=built.operator)
 
 
 def ball(size=32, rows=32, **settings):
@@ -279,7 +279,7 @@ def test_grey_light_takes_one_channel(grey_light, training, monkeypatch):
     assert len(one.arrays()["rows_0"]) == (1 if grey_light else 3)
     if not grey_light:
         return
-    monkeypatch.setattr("traitbrdf.transport.transport._is_grey", lambda scene: False)
+    monkeypatch.setattr("traitbrdf.transport.transport.is_grey", lambda scene: False)
     three = Transport(scene, GRID, training, rank=24)
     assert 2.0 * one.bytes < three.bytes
     for table in TABLES:
@@ -408,7 +408,7 @@ def test_odd_arrays_are_refused(built, on_ground):
 @pytest.fixture(scope="module")
 def fixed(on_ground, training):
     ground = flat(LIBRARY["concrete"])
-    return Transport(on_ground.scene, GRID, training, rank=24, fixed={1: ground})
+    return Transport(on_ground.scene, GRID, replace(training, fixed={1: ground}), rank=24)
 
 
 def test_a_fixed_part_is_shown_in_its_material(fixed, on_ground):
@@ -455,7 +455,7 @@ def test_odd_fixed_tables_are_refused(fixed, training):
     table = flat(LIBRARY["concrete"])
     for odd in ({2: table}, {-1: table}, {1: table[:, :2]}, {1: table[:-1]}):
         with pytest.raises(ValueError, match="fixed"):
-            Transport(fixed.scene, GRID, training, rank=8, fixed=odd)
+            Transport(fixed.scene, GRID, replace(training, fixed=odd), rank=8)
 
 
 # -- training ---------------------------------------------------------------------------------

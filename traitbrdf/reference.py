@@ -42,10 +42,26 @@ SHADOW_CELL = 0.0125
 """Greatest height in radians of a piece of the map that is visible or hidden as a whole."""
 
 _COARSEST = 0.2
-_MAX_CELLS = 1_000_000
+MAX_CELLS = 1_000_000
 _CHUNK = 1 << 17
 _BLOCK = 256  # samples whose results are kept at a time
 _GAUSS = 0.5 / math.sqrt(3.0)  # the two Gauss-Legendre points, from the middle, in widths
+
+
+class Shadows(NamedTuple):
+    """What the map's light meets on its way to surface points.
+
+    Attributes
+    ----------
+    visible : ``visible(point (m,), directions (m, 3)) -> (m,) bool``
+        Whether light from infinity reaches points, given by their index, from world directions.
+    cell : radians
+        Greatest height of a piece of the map that is visible or hidden as a whole; see the head of
+        this module.
+    """
+
+    visible: Visible
+    cell: float = SHADOW_CELL
 
 
 class IntegrationError(RuntimeError):
@@ -60,8 +76,7 @@ def radiance(
     lights: Sequence[Light | Arriving] = (),
     positions: Float64 | None = None,
     tolerance: float = 1e-4,
-    visible: Visible | None = None,
-    shadow_cell: float = SHADOW_CELL,
+    shadows: Shadows | None = None,
 ) -> tuple[Float64, Float64]:
     """Radiance that leaves surface points towards the viewer.
 
@@ -74,12 +89,8 @@ def radiance(
         Lights, which meet no shadow, or pairs (directions, irradiance) of light as it arrives.
     positions : (n, 3) world positions, needed for point lights
     tolerance : relative to the pixel's largest channel
-    visible : callable or None
-        ``visible(point (m,), directions (m, 3)) -> (m,)`` tells what the map's light meets on its
-        way to points given by their index; None lets all of it pass.
-    shadow_cell : radians
-        Greatest height of the pieces of the map that are visible or hidden as a whole (see the
-        head of this module).
+    shadows : Shadows or None
+        What the map's light meets on its way to the points; None lets all of it pass.
 
     Returns
     -------
@@ -95,10 +106,11 @@ def radiance(
     IntegrationError
         If the estimate stays above the tolerance.
     ValueError
-        If point lights come without positions, or `shadow_cell` is not above 0.
+        If point lights come without positions, or the shadows' cell is not above 0.
     """
-    if not shadow_cell > 0.0:
-        raise ValueError(f"shadow_cell: expected an angle above 0 radians, got {shadow_cell!r}")
+    if shadows is not None:
+        _check_cell(shadows.cell)
+    visible = None if shadows is None else shadows.visible
     count = len(normals)
     if positions is None:
         if any(isinstance(light, PointLight) for light in lights):
@@ -106,11 +118,11 @@ def radiance(
         positions = np.zeros((count, 3))
     result = np.zeros((count, len(brdfs), 3))
     error = np.zeros_like(result)
-    evaluate = _Evaluator(brdfs)
+    evaluate = Evaluator(brdfs)
     if environment is not None:
         result += _mirrored(normals, views, brdfs, environment, visible)
-        texels = _Cells.texels(environment.image)
-        pieces = None if visible is None else _Pieces(environment, shadow_cell)
+        texels = Cells.texels(environment.image)
+        pieces = None if shadows is None else Pieces(environment, shadows.cell)
         for p in range(count):
             cells = texels
             if pieces is not None and visible is not None:
@@ -158,7 +170,10 @@ def fragments(
         As `radiance` does; the points in its message are those of one block of samples.
     IndexError
         If there is no such fragment.
+    ValueError
+        If `shadow_cell` is not above 0.
     """
+    _check_cell(shadow_cell)
     chosen = np.asarray(index, np.int64)
     sample, owner, share = scene.samples(chosen)
     result = np.zeros((len(chosen), len(brdfs), 3))
@@ -180,8 +195,7 @@ def fragments(
                 scene.environment,
                 [scene.arriving(light, here) for light in scene.lights],
                 tolerance=tolerance,
-                visible=visible if needs_rays else None,
-                shadow_cell=shadow_cell,
+                shadows=Shadows(visible, shadow_cell) if needs_rays else None,
             )
             weight = share[some, None, None]
             np.add.at(result, owner[some], weight * values)
@@ -250,7 +264,7 @@ def tone_mapped_psnr(image: ArrayLike, reference: ArrayLike) -> float:
     return min(99.0, 10.0 * math.log10(255.0**2 / squared)) if squared > 0.0 else 99.0
 
 
-class _Evaluator:
+class Evaluator:
     """Sums f(wi, wo) * weight over directions, for all BRDFs at once.
 
     Tables on one grid share the look-up: radiance is linear in the table, so the weights are first
@@ -294,7 +308,7 @@ class _Evaluator:
         return result
 
 
-class _Cells(NamedTuple):
+class Cells(NamedTuple):
     """Lat-long rectangles of constant light: radiance (k, 3), and their edges (k,) in radians.
 
     `top` and `bottom` are polar angles from +y, `left` and `right` azimuths 2 pi u of the map.
@@ -307,7 +321,7 @@ class _Cells(NamedTuple):
     right: Float64
 
     @classmethod
-    def texels(cls, image: NDArray[np.float32]) -> _Cells:
+    def texels(cls, image: NDArray[np.float32]) -> Cells:
         """The texels of a map (M, N, 3) that shine, in row-major order."""
         rows, columns, _ = image.shape
         row, column = np.nonzero(image.max(axis=-1) > 0.0)
@@ -320,12 +334,12 @@ class _Cells(NamedTuple):
             (column + 1) * across,
         )
 
-    def take(self, which: NDArray[np.generic]) -> _Cells:
+    def take(self, which: NDArray[np.generic]) -> Cells:
         """The rectangles of an index or a mask."""
-        return _Cells(*(array[which] for array in self))
+        return Cells(*(array[which] for array in self))
 
 
-class _Pieces:
+class Pieces:
     """The map cut into what is visible or hidden as a whole."""
 
     def __init__(self, environment: EnvironmentMap, shadow_cell: float) -> None:
@@ -334,8 +348,8 @@ class _Pieces:
         n = math.ceil(math.pi / rows / shadow_cell)
         fine = EnvironmentMap(image.repeat(n, axis=0).repeat(n, axis=1))
         shining = fine.image.max(axis=-1) > 0.0
-        self.texels = _Cells.texels(image)
-        self.cells = _Cells.texels(fine.image)
+        self.texels = Cells.texels(image)
+        self.cells = Cells.texels(fine.image)
         # the texel that each piece is cut from, counted as in `texels`
         number = np.cumsum(image.max(axis=-1) > 0.0).reshape(rows, columns) - 1
         row, column = np.nonzero(shining)
@@ -346,7 +360,7 @@ class _Pieces:
         # no point of a piece is further from its centroid than this
         self.reach = np.hypot(math.pi / (rows * n), 2.0 * math.pi / (columns * n))
 
-    def seen(self, point: int, normal: Float64, visible: Visible) -> _Cells:
+    def seen(self, point: int, normal: Float64, visible: Visible) -> Cells:
         """The light that reaches a point with a world normal (3,).
 
         Texels that are not cut by a shadow stay whole: the integral is the same and sooner done.
@@ -361,7 +375,7 @@ class _Pieces:
         shaded = np.bincount(self.texel[above[~clear]], minlength=count) > 0
         whole = self.texels.take(lit & ~shaded)
         cut = self.cells.take(above[clear & (lit & shaded)[self.texel[above]]])
-        return _Cells(*(np.concatenate(pair) for pair in zip(whole, cut, strict=True)))
+        return Cells(*(np.concatenate(pair) for pair in zip(whole, cut, strict=True)))
 
 
 def _mirrored(
@@ -383,20 +397,20 @@ def _mirrored(
 
 
 def _converge(
-    cells: _Cells,
+    cells: Cells,
     n: Float64,
     v: Float64,
-    evaluate: _Evaluator,
+    evaluate: Evaluator,
     tolerance: float,
     point: int,
 ) -> tuple[Float64, Float64]:
     resolution = _COARSEST
-    previous = _integrate(cells, n, v, evaluate, resolution)
+    previous = integrate(cells, n, v, evaluate, resolution)
     while True:
         resolution *= 0.5
-        current = _integrate(cells, n, v, evaluate, resolution)
+        current = integrate(cells, n, v, evaluate, resolution)
         if current is None or previous is None:
-            raise IntegrationError(f"point {point}: more than {_MAX_CELLS} cells needed")
+            raise IntegrationError(f"point {point}: more than {MAX_CELLS} cells needed")
         error = np.abs(current - previous).max(axis=-1, keepdims=True)
         scale = tolerance * current.max(axis=-1, keepdims=True)
         if np.all(error <= scale):
@@ -405,11 +419,11 @@ def _converge(
         previous = current
 
 
-def _integrate(
-    cells: _Cells,
+def integrate(
+    cells: Cells,
     n: Float64,
     v: Float64,
-    evaluate: _Evaluator,
+    evaluate: Evaluator,
     resolution: float,
 ) -> Float64 | None:
     """The integral with cells no larger than `resolution` times their distance from the peak.
@@ -463,7 +477,7 @@ def _integrate(
                 weight = (0.5 * share * omega)[large] * np.maximum(point @ n, 0.0)
                 samples.append((point, light[large] * weight[:, None]))
         used += len(top)
-        if used > _MAX_CELLS:
+        if used > MAX_CELLS:
             return None
         light = np.tile(light[cut], (4, 1))
         top, bottom, left, right = top[cut], bottom[cut], left[cut], right[cut]
@@ -483,6 +497,12 @@ def _integrate(
             local = np.asarray(to_local(w[i : i + _CHUNK], n), np.float64)
             total += evaluate(local, wo, weight[i : i + _CHUNK])
     return total
+
+
+def _check_cell(angle: float) -> None:
+    """Raise ValueError unless the greatest height of a piece is an angle above 0."""
+    if not angle > 0.0:
+        raise ValueError(f"shadow_cell: expected an angle above 0 radians, got {angle!r}")
 
 
 def _direction(polar: Float64, azimuth: Float64) -> Float64:

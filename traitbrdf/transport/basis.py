@@ -7,7 +7,8 @@ section 3), so all frames lie in the span of the images of a training set.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -92,10 +93,20 @@ class Basis:
 
 @dataclass(frozen=True)
 class Training:
-    """Scalar tables (cells, T) float32 that a basis is fitted to, and what each counts (T,)."""
+    """What the bases of a transport are fitted to.
+
+    Attributes
+    ----------
+    tables : (cells, T) float32 scalar tables, in 1/sr
+    weight : (T,) float64, how much each table counts
+    fixed : tables (cells, 3) float32 by index into ``scene.parts``
+        Parts that keep their material. A group of nothing else is prepared for these tables alone,
+        which takes a fraction of the time; `Transport.freed` prepares it for all others.
+    """
 
     tables: Float32
     weight: Float64
+    fixed: Mapping[int, Float32] = field(default_factory=dict)
 
 
 def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Training:
@@ -159,21 +170,6 @@ def per_colour(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.mv(matrices[c], vectors[c]) for c in range(3)])
 
 
-def eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eigenvalues, ascending, and eigenvectors, on one thread.
-
-    Several threads would meet at thousands of barriers, and where other work shares the cores each
-    of them costs a time slice: seconds for what one thread does in milliseconds.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        values, vectors = torch.linalg.eigh(symmetric)
-    finally:
-        torch.set_num_threads(threads)
-    return values, vectors
-
-
 def damping_of(images: torch.Tensor) -> torch.Tensor:
     """Factors (P,) for images (C, P, R), 1 but for pixels that stand far above the others.
 
@@ -198,7 +194,7 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
     for piece in pieces:  # singular values over eight decades: single precision would lose four
         columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
         gram += columns.T @ columns
-    squares, vectors = eigh(gram)
+    squares, vectors = torch.linalg.eigh(gram)
     squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
     kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
     turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
@@ -215,7 +211,7 @@ def extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
     fresh = fresh / fresh.norm(dim=0).clamp_min(1e-30)
     for _ in range(2):  # the second pass removes what rounding left of the first
         fresh = fresh - known @ (known.T @ fresh)
-    squares, vectors = eigh(fresh.T @ fresh)
+    squares, vectors = torch.linalg.eigh(fresh.T @ fresh)
     keep = squares > 1e-10  # grey light, or an image that is known already, adds fewer
     fresh = (fresh @ vectors[:, keep]) * squares[keep].rsqrt()
     return torch.cat([basis, fresh.float()], dim=1)

@@ -48,7 +48,7 @@ from traitbrdf.transport.kernels import (
     Tables,
     TreeArrays,
     VisibilityMasks,
-    interpolate_masks,
+    interpolate_images,
     one_leaf,
     shade_rows,
 )
@@ -73,7 +73,7 @@ f32 = np.float32
 _SPLIT = (0.15, 0.35)
 """theta_h in radians between which the window passes from near to far, at a scale of 1."""
 
-_FLAT = 0.03
+FLAT = 0.03
 """How much of their largest value tables may change within the width of their lobes."""
 
 _OUTLINE = 0.03
@@ -173,20 +173,20 @@ class Operator:
         # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
         # need leaves of half that size
         fine = border * (0.5 / 1.6, 1.0, 1.0, 1.0)
-        self._rules = np.stack([rule, border]).astype(np.float32)
-        self._exact_rules = np.stack([rule, fine]).astype(np.float32)
-        self._capacity = int(1600 * resolution**2) + 200
+        self.rules = np.stack([rule, border]).astype(np.float32)
+        self.exact_rules = np.stack([rule, fine]).astype(np.float32)
+        self.capacity = int(1600 * resolution**2) + 200
         to_map = scene.environment.to_map
         self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
         self._views = np.ascontiguousarray(to_map(scene.views), np.float32)
         # the sample that stands for a fragment where one must: the middle one
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
-        self._visibility: Visibility | None = None
+        self.visibility: Visibility | None = None
         if any(scene.casts):
             wide = 1.0 / (resolution if shadows is None else shadows)
             width = min(wide, math.sqrt(wide))  # shadows blur less well than lobes do
             cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
-            self._visibility = Visibility(scene, cut, self._middle)
+            self.visibility = Visibility(scene, cut, self._middle)
         self._plans: dict[int, Plan] = {}
 
     # -- single fragments -----------------------------------------------------------------------
@@ -215,7 +215,7 @@ class Operator:
             place = np.full(span.stop - span.start, -1)
             place[at[mine] - span.start] = mine
             everything = np.arange(span.start, span.stop)
-            masks = self._plan(part).mask_rows
+            masks = self.plan(part).mask_rows
             self._shade(out, everything, masks, _Lobes(), _NO_TABLES, place=place)
         self._add_lights(out, at, _NO_TABLES)
         return out
@@ -241,7 +241,7 @@ class Operator:
         return out.astype(np.float32)
 
     def _core_of(self, tables: Float32) -> float:
-        return min(self.core, _core(self.grid, tables))
+        return min(self.core, core_of(self.grid, tables))
 
     # -- whole parts ----------------------------------------------------------------------------
 
@@ -265,11 +265,11 @@ class Operator:
         tables = np.ascontiguousarray(tables, np.float32)
         if len(index) == 0:
             return np.zeros((0, 3, tables.shape[1]), np.float32)
-        plan = self._plan(part, report)
+        plan = self.plan(part, report)
         # narrower lobes are interpolated where neighbouring pixels differ less
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
         low, high = (float(self.grid.theta_h[node]) for node in nodes)
-        lobe = _lobe(self.grid, tables, plan.grazing)
+        lobe = lobe_of(self.grid, tables, plan.grazing)
         broad = lobe >= high  # nothing is near
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
@@ -291,7 +291,7 @@ class Operator:
             lambda fraction: report("far images", fraction),
         )  # fmt: skip
         out = np.empty((len(index), 3, tables.shape[1]), np.float32)
-        interpolate_masks(out, coarse, plan.corners, plan.weights)
+        interpolate_images(out, coarse, plan.corners, plan.weights)
         if not broad:
             self._shade(
                 out, index, plan.mask_rows, _Lobes((-1.0, high), lobe), tables * near[:, None],
@@ -342,8 +342,8 @@ class Operator:
                 scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
             )  # fmt: skip
         own_row = np.full(len(sample), -1, np.int32)
-        if self._visibility is not None:
-            own_row = self._visibility.row_of_sample[sample]
+        if self.visibility is not None:
+            own_row = self.visibility.row_of_sample[sample]
             united[owner[own_row >= 0]] = False
         alone = group < 0
         group[alone] = found + np.arange(alone.sum())
@@ -374,18 +374,18 @@ class Operator:
         low, high = lobes.window
         low, high = math.sin(max(low, -0.5)), math.sin(min(high, 0.5 * math.pi))
         masks = _NO_MASKS
-        if self._visibility is not None:
-            cut = self._visibility.cut
-            masks = VisibilityMasks(cut.first, cut.last, *self._visibility.masks)
+        if self.visibility is not None:
+            cut = self.visibility.cut
+            masks = VisibilityMasks(cut.first, cut.last, *self.visibility.masks)
         exact = lobes.exact or self.resolution > 1.0
         core = self.core if lobes.core is None else lobes.core
         rules = np.concatenate(
-            [self._exact_rules if exact else self._rules, np.full((2, 1), core, np.float32)], axis=1
+            [self.exact_rules if exact else self.rules, np.full((2, 1), core, np.float32)], axis=1
         )
         settings = QuadratureSettings(
             rules, f32(low), f32(high if high < 1.0 else 9.0),
             f32(math.sin(_OUTLINE) if lobes.width <= _SPLIT[1] else -9.0),
-            f32(math.sin(lobes.width)), self._capacity,
+            f32(math.sin(lobes.width)), self.capacity,
         )  # fmt: skip
         return _Light(self._nodes, masks, settings)
 
@@ -425,7 +425,7 @@ class Operator:
 
     def _shade_all(self, out: Float32, bundles: Bundles, light: _Light, tables: Float32) -> None:
         """Shade bundles; repeat with twice the room those that have more leaves than it holds."""
-        settings = light.settings._replace(capacity=self._capacity)
+        settings = light.settings._replace(capacity=self.capacity)
         while len(bundles.several):
             light = light._replace(settings=settings)
             bundles = bundles.take(self._shade_some(out, bundles, light, tables))
@@ -484,13 +484,13 @@ class Operator:
     def _own_rows(self, index: Int64) -> NDArray[np.int32]:
         """(m, 4) with each fragment's own visibility row first, -1 where it has none."""
         rows = np.full((len(index), 4), -1, np.int32)
-        if self._visibility is not None:
-            rows[:, 0] = self._visibility.row_of[index]
+        if self.visibility is not None:
+            rows[:, 0] = self.visibility.row_of[index]
         return rows
 
     def _mask_rows(self, index: Int64) -> NDArray[np.int32]:
         """Own rows (m, 4) of any fragments; rays are cast for those that have none yet."""
-        visibility = self._visibility
+        visibility = self.visibility
         if visibility is None or not len(index):
             return self._own_rows(index)
         casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
@@ -507,14 +507,14 @@ class Operator:
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
         """Cast a part's rays and find where its far images are computed, if that is not done."""
-        self._plan(part, progress)
+        self.plan(part, progress)
 
-    def _plan(self, part: int, progress: Progress | None = None) -> Plan:
+    def plan(self, part: int, progress: Progress | None = None) -> Plan:
         if part not in self._plans:
             report = progress or (lambda stage, fraction: None)
             loose = max(1.0, 1.0 / self.resolution)
             fine = self.resolution > 1.0
-            self._plans[part] = Plan.make(self.scene, part, self._visibility, loose, fine, report)
+            self._plans[part] = Plan.make(self.scene, part, self.visibility, loose, fine, report)
         return self._plans[part]
 
 
@@ -541,19 +541,19 @@ def _near_window(grid: HalfDiffGrid, low: float, high: float) -> Float32:
     return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
 
 
-def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
+def lobe_of(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
     """The theta_h within which tables (grid.size, T) hardly change: the width of their lobes.
 
     Views further from the normal than `grazing` are not asked for.
     """
     seen = grid.theta_d <= grazing + _SPLIT[1]
     values = tables.reshape(*grid.shape, -1)[:, seen].reshape(grid.shape[0], -1, tables.shape[1])
-    change = np.abs(values - values[0]).max(axis=1) > _FLAT * np.abs(values).max(axis=(0, 1))
+    change = np.abs(values - values[0]).max(axis=1) > FLAT * np.abs(values).max(axis=(0, 1))
     steps = np.flatnonzero(change.any(axis=1))
     return float(grid.theta_h[max(steps[0] - 1, 0)]) if len(steps) else 0.5 * math.pi
 
 
-def _core(grid: HalfDiffGrid, tables: Float32) -> float:
+def core_of(grid: HalfDiffGrid, tables: Float32) -> float:
     """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
 
     Peaks are looked for where they are a notable share of their table's; `CORE` at most.

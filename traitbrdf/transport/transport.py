@@ -52,7 +52,6 @@ from traitbrdf.transport.basis import (
     Basis,
     Training,
     damping_of,
-    eigh,
     extended,
     leading,
     per_colour,
@@ -110,9 +109,6 @@ class Transport:
         Chooses the subset and the probes.
     device : torch device of the frames
     progress : called with (stage, fraction); may raise to cancel
-    fixed : tables (grid.size, 3) by index into ``scene.parts``
-        Parts that keep their material. A group of nothing else is prepared for these tables alone,
-        which takes a fraction of the time; `freed` prepares it for all others.
     """
 
     TRAINING_ROWS = 320
@@ -136,18 +132,17 @@ class Transport:
         seed: int = 0,
         device: str | torch.device = "cpu",
         progress: Progress | None = None,
-        fixed: Mapping[int, Float32] | None = None,
     ) -> None:
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
-        for part, table in (fixed or {}).items():
+        for part, table in training.fixed.items():
             if not 0 <= part < len(scene.parts) or table.shape != (grid.size, 3):
                 raise ValueError(
                     f"fixed: expected tables ({grid.size}, 3) of {len(scene.parts)} parts, got "
                     f"{table.shape} for part {part}"
                 )
         self._begin(scene, grid, rank, resolution, device)
-        self._compress_groups(training, fixed or {}, {}, seed, progress)
+        self._compress_groups(training, {}, seed, progress)
 
     def freed(
         self, training: Training, seed: int = 0, progress: Progress | None = None
@@ -169,7 +164,7 @@ class Transport:
         for part in range(len(self.parts)):
             if part not in self.fixed:
                 other.parts[part] = self.parts[part]
-        other._compress_groups(training, {}, known, seed, progress)
+        other._compress_groups(replace(training, fixed={}), known, seed, progress)
         return other
 
     def truncated(self, rank: int) -> Transport:
@@ -251,7 +246,6 @@ class Transport:
     def _compress_groups(
         self,
         training: Training,
-        fixed: Mapping[int, Float32],
         known: Mapping[int, Basis],
         seed: int,
         progress: Progress | None,
@@ -266,7 +260,7 @@ class Transport:
         report = progress or (lambda stage, fraction: None)
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
-        groups = self._groups()
+        groups, fixed = self._groups(), training.fixed
         # the next part's rays are cast while others are shaded
         cancelled, operator = threading.Event(), self.operator
 
@@ -327,7 +321,7 @@ class Transport:
         self.rank = rank
         self.resolution = resolution
         self.device = torch.device(device)
-        self.grey = _is_grey(scene)
+        self.grey = is_grey(scene)
         """Whether all light is grey, so that one channel of the basis serves all three."""
         self.dtype = torch.float32
         """What the basis images are kept in: see `stored`."""
@@ -448,7 +442,7 @@ class Transport:
         weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
         images = images * weight
         # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
-        squares, u = eigh(images @ images.T)
+        squares, u = torch.linalg.eigh(images @ images.T)
         count = min(self.rank if self.grey else math.ceil(self.TABLES * self.rank), len(squares))
         enough = squares.flip(0) > (0.1 * self.ENOUGH) ** 2 * squares[-1]
         count = max(1, min(count, int(enough.sum())))
@@ -473,7 +467,7 @@ class Transport:
         weight = torch.from_numpy(importance)
         at = torch.from_numpy(chosen)
         sampled = basis[at].double() * weight[:, None]
-        squares, vectors = eigh(sampled.T @ sampled)
+        squares, vectors = torch.linalg.eigh(sampled.T @ sampled)
         keep = squares > 1e-9 * squares[-1].clamp_min(1e-30)
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale) @ vectors.T
@@ -587,6 +581,7 @@ class Transport:
         grid: HalfDiffGrid,
         arrays: Mapping[str, NDArray[Any]],
         device: str | torch.device = "cpu",
+        operator: Operator | None = None,
     ) -> Transport:
         """The transport of `arrays` for the scene and grid that it was prepared for.
 
@@ -600,6 +595,7 @@ class Transport:
         if rank.shape != () or rank.dtype.kind != "i" or resolution.dtype.kind != "f":
             raise ValueError("arrays: expected a rank and a resolution")
         self._begin(scene, grid, int(rank), float(resolution), device)
+        self._operator = operator
         colours = 1 if self.grey else 3
 
         def taken(name: str, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -774,7 +770,7 @@ class Transport:
         return deviation / level if level > 0.0 else deviation
 
 
-def _is_grey(scene: Scene) -> bool:
+def is_grey(scene: Scene) -> bool:
     image = scene.environment.image
     colours = [np.asarray(c) for light in scene.lights for c in [_colour(light)]]
     same = bool((image[..., 1:] == image[..., :1]).all())
