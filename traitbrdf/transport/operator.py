@@ -1,26 +1,27 @@
 """Rows of the transport operator: the light that reaches a pixel, cut into leaves of one tree.
 
-For one pixel I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d): linear in the table's
-cells. A *leaf* is a piece of the environment map with its exact vector irradiance. `Operator`
-turns leaves into rows (a weight for every cell) or, far cheaper, into images of given tables.
+The radiance of a pixel is I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d), which is
+linear in the table's cells. A *leaf* is a piece of the environment map with its exact vector
+irradiance. `Operator` turns leaves into rows (a weight for every cell) or, which is much cheaper,
+into images of given tables.
 
-*Leaves.* The map is walked as a tree (`LightTree`; Walter et al. 2005): a node of light stands for
+*Leaves.* The map is walked as a tree (`LightTree`; Walter et al. 2005). A node of light stands for
 its texels where it looks small from the mirror peak, measured in half-vector space; a texel that
-looks large is cut further. A node's irradiance is exact, and its own extent is carried into theta_h
-to second order (two samples one standard deviation apart), so the error falls with the fourth power
-of the node size while the number of nodes grows with its inverse square.
+looks large is cut further. A node's irradiance is exact, and its extent is carried into theta_h to
+second order (two samples one standard deviation apart). So the error falls with the fourth power of
+the node size, while the number of nodes grows with its inverse square.
 
-*Shadows.* A cut through the tree, some thousand nodes of little light each, gets one shadow ray a
-node (`VisibilityCut`), bright lights down to single texels. Neighbouring pixels see nearly the same
-occluders: rays are cast on a coarse lattice of pixels, and between lattice points only where those
-around disagree; at borders, where a pixel's samples lie on either side of an edge, of every sample.
-Near the mirror direction, where a glossy surface shows the occluder's outline, leaves at that
-outline cast their own rays.
+*Shadows.* A cut through the tree has some thousand nodes of little light each, and bright lights
+are cut down to single texels. Each node of the cut gets one shadow ray (`VisibilityCut`).
+Neighbouring pixels see nearly the same occluders, so rays are cast on a coarse lattice of pixels,
+and between lattice points only where the points around disagree. At borders, where the samples of a
+pixel lie on both sides of an edge, rays are cast for every sample. A glossy surface shows the
+outline of an occluder near the mirror direction; leaves there cast rays of their own.
 
-*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel: they are
-computed on the lattice and interpolated, wherever normals and shadows vary linearly over its
-cells; elsewhere, and for the narrow rest, every pixel is computed. The two are separated by a
-smooth window over theta_h, so their sum is exact.
+*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel. These far
+images are computed on the lattice, and interpolated wherever normals and shadows vary linearly over
+its cells. Elsewhere, and for the narrow rest (near images), every pixel is computed. A smooth
+window over theta_h separates the two, so their sum is exact.
 
 References
 ----------
@@ -71,43 +72,42 @@ Int64 = NDArray[np.int64]
 f32 = np.float32
 
 _SPLIT = (0.15, 0.35)
-"""theta_h in radians between which the window passes from near to far, at a scale of 1."""
+"""theta_h in radians over which the window passes from near to far, at a scale of 1."""
 
 FLAT = 0.03
-"""How much of their largest value tables may change within the width of their lobes."""
+"""Greatest change of a table within the width of its lobe, relative to its largest value."""
 
 _OUTLINE = 0.03
-"""theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
+"""theta_h in radians up to which leaves at an occluder's outline cast rays of their own."""
 
 _CUT = (0.09, 1 / 500)
-"""Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
+"""Greatest radius (radians) and greatest share of the flux of a node of the visibility cut."""
 
 _QUESTIONS = 192
-"""Most rays of its own that a sample casts at occluders' outlines."""
+"""Most rays that a group of samples casts at the outlines of occluders."""
 
 CORE = 3e-3
-"""theta_h in radians: leaves at a mirror peak are as small as peaks of twice that width need."""
+"""theta_h in radians: half the width of the narrowest peak that leaves resolve by default."""
 
 SHARPEST = 1e-4
-"""The same for the narrowest peaks that a table holds."""
+"""theta_h in radians: half the width of the narrowest peak that any table is resolved to."""
 
 _SHARED = ((4, 0.002), (2, 0.007))
-"""Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
+"""Side in pixels of blocks that share one walk, and how far their half vectors may differ in
+radians."""
 
 _UNITED = 0.007
-"""The same for the samples of one fragment."""
+"""How far the half vectors of the samples of a fragment may differ for one walk, in radians."""
 
 
 class _Lobes(NamedTuple):
-    """Which lobes leaves have to resolve.
+    """The lobes that leaves have to resolve.
 
     Attributes
     ----------
-    window : theta_h in radians of the light that is added, from and to
-    width : radians
-        No leaves are finer than lobes of this width need.
-    core : radians, or None for the operator's
-        No leaves at a mirror peak are wider than peaks of twice this width bear.
+    window : range of theta_h in radians of the light that is added
+    width : theta_h in radians within which the tables hardly change
+    core : half the width of the narrowest peak in radians; None for the operator's
     exact : whether leaves are as fine as sharp lobes need at silhouettes
     """
 
@@ -126,7 +126,7 @@ class _Light(NamedTuple):
 
 
 class Operator:
-    """Rows of W: what every cell of a table contributes to a fragment of the scene.
+    """The transport operator W of a scene: what every cell of a table adds to every fragment.
 
     Parameters
     ----------
@@ -134,12 +134,28 @@ class Operator:
     grid : HalfDiffGrid of the "folded" layout
     resolution : float
         1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
-    tree : what `light_tree` makes of the scene's map, if it is at hand
+    tree : LightTree or None
+        What `light_tree` makes of the scene's map, if it was built before.
     core : float
-        In radians, half the width in theta_h of the narrowest peak that rows and interpolated
-        images resolve. Exact images resolve what their tables hold.
+        Half the width in theta_h, in radians, of the narrowest peak that rows and interpolated
+        images resolve. Exact images resolve the peaks of their tables.
     shadows : float or None
-        The same as `resolution` for the visibility nodes alone; None: as that has it.
+        Resolution of the visibility nodes alone; None for `resolution`.
+
+    Attributes
+    ----------
+    visibility : Visibility or None
+        Shared visibility of the fragments; None where nothing casts shadows.
+    rules, exact_rules : (2, 4) float32
+        How finely leaves are cut for interpolated and for exact images: the first four columns of
+        `QuadratureSettings.rules`.
+    capacity : int
+        Room for the leaves of one group of samples; doubled for groups that need more.
+
+    Raises
+    ------
+    ValueError
+        If the grid has another layout, or a number is not positive and finite.
     """
 
     def __init__(
@@ -167,11 +183,11 @@ class Operator:
         self.tree = tree
         self._nodes = TreeArrays(*self.tree.packed, environment.image)
         scale = 1.0 / resolution
-        # sharp lobes are lost where the leaves at their peaks grow wider than these
+        # wider leaves than these at a peak would lose sharp lobes
         rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
         border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
-        # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
-        # need leaves of half that size
+        # exact images serve sharp lobes, which need leaves of half that size at the grazing angles
+        # of a silhouette
         fine = border * (0.5 / 1.6, 1.0, 1.0, 1.0)
         self.rules = np.stack([rule, border]).astype(np.float32)
         self.exact_rules = np.stack([rule, fine]).astype(np.float32)
@@ -179,7 +195,7 @@ class Operator:
         to_map = scene.environment.to_map
         self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
         self._views = np.ascontiguousarray(to_map(scene.views), np.float32)
-        # the sample that stands for a fragment where one must: the middle one
+        # where one sample has to stand for a fragment, it is the middle one
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
         self.visibility: Visibility | None = None
         if any(scene.casts):
@@ -192,7 +208,13 @@ class Operator:
     # -- single fragments -----------------------------------------------------------------------
 
     def rows(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
+        """Compute rows of W: (m, 3, grid.size) float32, one for each fragment and colour.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Fragments of the scene.
+        """
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
         self._shade(out, at, self._mask_rows(at), _Lobes(), _NO_TABLES)
@@ -200,10 +222,15 @@ class Operator:
         return out
 
     def rows_as_shown(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3, grid.size) rows of distinct fragments `index` (m,), as `part_images` sees them.
+        """Compute the rows of W, (m, 3, grid.size) float32, that `part_images` applies.
 
-        With the shadows and the leaves that they share with the pixels around: the images and
-        these rows are of one operator, while those of `rows` are a little nearer to the truth.
+        They use the shadows and the leaves that fragments share with the pixels around them, so
+        these rows and the images belong to one operator. Those of `rows` are slightly more exact.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Distinct fragments of the scene.
         """
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
@@ -221,7 +248,14 @@ class Operator:
         return out
 
     def images(self, index: NDArray[np.integer], tables: Float32) -> Float32:
-        """(m, 3, T) radiance of the fragments `index` (m,) under scalar tables (grid.size, T)."""
+        """Compute the radiance (m, 3, T) float32 of fragments under scalar tables.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Fragments of the scene.
+        tables : (grid.size, T) float32, in 1/sr
+        """
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
@@ -230,7 +264,7 @@ class Operator:
         return out
 
     def mirror(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3) what a perfect mirror shows at the fragments `index` (m,)."""
+        """Compute the radiance (m, 3) float32 that a perfect mirror shows at fragments (m,)."""
         scene = self.scene
         index = np.asarray(index, np.int64)
         sample, owner, share = scene.samples(index)
@@ -252,12 +286,18 @@ class Operator:
         progress: Progress | None = None,
         interpolate: bool = True,
     ) -> Float32:
-        """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
+        """Compute the radiance (P, 3, T) float32 of all fragments of a part under scalar tables.
 
-        Shadows are interpolated where rays agree, and far images where that is safe, unless
-        `interpolate` is False: an order of magnitude faster than `images`. Lobes that are wide
-        for the part have nothing but far images, and no leaves finer than they need. Peaks narrower
-        than the operator's `core` are resolved only without interpolation.
+        Parameters
+        ----------
+        part : int
+            Index into ``scene.parts``.
+        tables : (grid.size, T) float32, in 1/sr
+        progress : called with (stage, fraction done); may raise to cancel
+        interpolate : bool
+            Interpolate shadows where rays agree, and far images where normals and shadows vary
+            linearly. This is ten times faster than `images`, and resolves peaks down to the
+            operator's `core` only. Tables without narrow lobes have far images alone, in any case.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
@@ -266,11 +306,11 @@ class Operator:
         if len(index) == 0:
             return np.zeros((0, 3, tables.shape[1]), np.float32)
         plan = self.plan(part, report)
-        # narrower lobes are interpolated where neighbouring pixels differ less
+        # where neighbouring pixels differ less, narrower lobes are interpolated too
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
         low, high = (float(self.grid.theta_h[node]) for node in nodes)
         lobe = lobe_of(self.grid, tables, plan.grazing)
-        broad = lobe >= high  # nothing is near
+        broad = lobe >= high  # there is no near image
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             lobes = _Lobes(width=lobe, core=self._core_of(tables), exact=True)
@@ -303,7 +343,7 @@ class Operator:
     # -- leaves ---------------------------------------------------------------------------------
 
     def _bundles(self, index: Int64, mask_rows: NDArray[np.int32]) -> Bundles:
-        """The samples of fragments `index`, in groups that share one walk through the light."""
+        """Return the samples of fragments `index`, in groups that share one walk of the tree."""
         scene = self.scene
         sample, owner, share = scene.samples(index)
         count = np.bincount(owner, minlength=len(index))
@@ -312,7 +352,7 @@ class Operator:
         single = np.flatnonzero(count == 1)
         x, y = scene.pixels[index] % scene.width, scene.pixels[index] // scene.width
         part = scene.pixel_part[index].astype(np.int64)
-        group = np.full(len(index), -1, np.int64)  # of fragments of one sample
+        group = np.full(len(index), -1, np.int64)  # of each fragment of one sample
         found = 0
         for side, limit in _SHARED:
             key = (part[single] * (scene.height + side) + y[single] // side) * (
@@ -332,7 +372,7 @@ class Operator:
             group[member[joined]] = found + np.repeat(np.arange(alike.sum()), size[alike])
             found += int(alike.sum())
             single = np.sort(member[~joined])
-        # a bundle is a group of fragments, or one fragment, whose samples are a group each, or one
+        # a bundle is a group of fragments, or one fragment whose samples are one or many groups
         sampled = np.flatnonzero(count > 1)
         united = np.zeros(len(index), bool)
         if len(sampled):
@@ -399,11 +439,11 @@ class Operator:
         report: Callable[[float], None] = lambda fraction: None,
         place: Int64 | None = None,
     ) -> None:
-        """Add light to the fragments `index`.
+        """Add the light of the map to fragments.
 
         Parameters
         ----------
-        out : (m, 3, T) radiance under the tables, or (m, 3, cells) rows if there are no tables
+        out : (m, 3, T) radiance under the tables, or (m, 3, cells) rows where T is 0
         index : (m,) fragments
         mask_rows : (m, 4) visibility rows that surround each fragment, -1 for none
         lobes : which leaves are taken
@@ -442,7 +482,7 @@ class Operator:
         unanswered = Questions(ask, np.ones((groups, _QUESTIONS), np.uint8), False)
         shade_rows(out, asked, unanswered, bundles, *light, shown)
         again = asked > 0
-        # where rays decide, pixels do not share them
+        # pixels that need rays do not share a walk
         shared = again & (np.diff(bundles.group_start) > 1)
         again &= ~shared
         if shared.any():
@@ -460,7 +500,7 @@ class Operator:
         return asked < 0
 
     def _add_lights(self, out: Float32, index: Int64, tables: Float32) -> None:
-        """Add the point and directional lights, each one leaf a sample."""
+        """Add the point and directional lights: each is one leaf for every sample."""
         scene = self.scene
         step = 1 << 16
         for light in scene.lights:
@@ -471,7 +511,7 @@ class Operator:
                 leaves = np.zeros((len(sample), 13, 1), np.float32)
                 local = scene.environment.to_map(toward)
                 leaves[:, :3, 0] = local
-                # the vector irradiance of a light: what faces it fully gets it fully
+                # vector irradiance: a surface that faces the light gets all of it
                 leaves[:, 3:12, 0] = (irradiance[:, :, None] * local[:, None, :]).reshape(-1, 9)
                 starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
                 one_leaf(
@@ -482,14 +522,14 @@ class Operator:
     # -- visibility -----------------------------------------------------------------------------
 
     def _own_rows(self, index: Int64) -> NDArray[np.int32]:
-        """(m, 4) with each fragment's own visibility row first, -1 where it has none."""
+        """Return (m, 4) with each fragment's own visibility row first; -1 for none."""
         rows = np.full((len(index), 4), -1, np.int32)
         if self.visibility is not None:
             rows[:, 0] = self.visibility.row_of[index]
         return rows
 
     def _mask_rows(self, index: Int64) -> NDArray[np.int32]:
-        """Own rows (m, 4) of any fragments; rays are cast for those that have none yet."""
+        """Return own rows (m, 4) of any fragments, and cast rays for those that have none yet."""
         visibility = self.visibility
         if visibility is None or not len(index):
             return self._own_rows(index)
@@ -506,10 +546,18 @@ class Operator:
         return self._own_rows(index)
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
-        """Cast a part's rays and find where its far images are computed, if that is not done."""
+        """Cast a part's rays and choose where its far images are computed, unless that is done.
+
+        Parameters
+        ----------
+        part : int
+            Index into ``scene.parts``.
+        progress : called with (stage, fraction done); may raise to cancel
+        """
         self.plan(part, progress)
 
     def plan(self, part: int, progress: Progress | None = None) -> Plan:
+        """Return where a part's far images are computed; see `prepare`."""
         if part not in self._plans:
             report = progress or (lambda stage, fraction: None)
             loose = max(1.0, 1.0 / self.resolution)
@@ -519,13 +567,15 @@ class Operator:
 
 
 def light_tree(environment: EnvironmentMap) -> LightTree:
-    """The tree that an `Operator` walks; build it once for several operators under one map."""
+    """Build the tree that an `Operator` walks, to share it between operators under one map."""
     return LightTree.build(_divided(environment))
 
 
 def _divided(environment: EnvironmentMap) -> EnvironmentMap:
-    """The same light in texels of at most 1/256 of a half turn: each is hidden or not as a whole,
-    and small enough for series about its centre."""
+    """Return the same light in texels of at most 1/256 of a half turn.
+
+    A texel is visible or hidden as a whole, and the walk uses series about its centre.
+    """
     rows, columns, _ = environment.image.shape
     down, across = -(-256 // rows), -(-512 // columns)
     if down == across == 1:
@@ -535,16 +585,24 @@ def _divided(environment: EnvironmentMap) -> EnvironmentMap:
 
 
 def _near_window(grid: HalfDiffGrid, low: float, high: float) -> Float32:
-    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 from `low` to `high`,
-    which are nodes: so leaves of either side meet none of the other's."""
+    """Return the window (theta_h nodes,) of near images: 1, then a smooth fall to 0.
+
+    The fall begins at `low` and ends at `high`. Both are nodes, so no leaf beyond either of them
+    touches a cell of the other side.
+    """
     t = np.clip((grid.theta_h - low) / (high - low), 0.0, 1.0)
     return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
 
 
 def lobe_of(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
-    """The theta_h within which tables (grid.size, T) hardly change: the width of their lobes.
+    """Return the theta_h in radians within which tables hardly change: the width of their lobes.
 
-    Views further from the normal than `grazing` are not asked for.
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    tables : (grid.size, T) float32
+    grazing : float
+        Largest angle in radians of a view from its normal; cells beyond it do not count.
     """
     seen = grid.theta_d <= grazing + _SPLIT[1]
     values = tables.reshape(*grid.shape, -1)[:, seen].reshape(grid.shape[0], -1, tables.shape[1])
@@ -554,9 +612,15 @@ def lobe_of(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
 
 
 def core_of(grid: HalfDiffGrid, tables: Float32) -> float:
-    """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
+    """Return half the theta_h in radians where the narrowest peak of tables falls to its half.
 
-    Peaks are looked for where they are a notable share of their table's; `CORE` at most.
+    Only peaks above a hundredth of their table's highest count. The result is from `SHARPEST` to
+    `CORE`.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    tables : (grid.size, T) float32
     """
     nodes = int(np.searchsorted(grid.theta_h, 2.0 * CORE)) + 1
     values = tables.reshape(grid.shape[0], -1, tables.shape[1])[:nodes]
