@@ -3,8 +3,9 @@
 Torch cannot express these loops: they descend trees and sum lists of different lengths. Numba
 compiles them. Everything that runs while a user paints is torch, on any device.
 
-Named tuples group the arguments. A loop that numba runs in parallel may write only to arrays that
-are arguments of their own: numba removes an assignment to an array of a tuple as dead code.
+Named tuples group the arguments; `traitbrdf.transport.arrays` has those that callers make. A loop
+that numba runs in parallel may write only to arrays that are arguments of their own: numba removes
+an assignment to an array of a tuple as dead code.
 """
 
 from __future__ import annotations
@@ -15,119 +16,16 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from traitbrdf.transport.arrays import (
+    QuadratureSettings,
+    Questions,
+    Tables,
+    TreeArrays,
+    VisibilityMasks,
+)
+
 f32 = np.float32
 _UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
-
-
-class TreeArrays(NamedTuple):
-    """The light tree as the walk reads it, and the map that the tree was built from.
-
-    Attributes
-    ----------
-    place : (n, 8) float32
-        Unit direction of a node's light, radius in radians, variance; the rest is padding.
-    moment : (n, 12) float32
-        Vector irradiance: x, y, z of red, of green, of blue; the rest is padding.
-    child : (n, 2) int32
-        Indices of the two halves, -1 where there is none, -2 where the node is a leaf.
-    box : (n, 4) int32
-        First row, last row + 1, first column, last column + 1 of a node's texels.
-    image : (rows, columns, 3) float32
-        Radiance of the map's texels.
-    """
-
-    place: Any
-    moment: Any
-    child: Any
-    box: Any
-    image: Any
-
-
-class VisibilityMasks(NamedTuple):
-    """Shared visibility of the nodes of one cut: one bit a node, 64 nodes in a word.
-
-    A node counts as surely visible (or surely hidden) if its nearest neighbours agree with it.
-
-    Attributes
-    ----------
-    first, last : (n,) int32
-        The cut nodes under (or above) a node of the tree are `first` to `last - 1`.
-    hidden : (rows, words) uint64
-        Nodes that are hidden.
-    unseen : (rows, words) uint64
-        Nodes that are not surely visible.
-    unhidden : (rows, words) uint64
-        Nodes that are not surely hidden.
-    """
-
-    first: Any
-    last: Any
-    hidden: Any
-    unseen: Any
-    unhidden: Any
-
-
-class QuadratureSettings(NamedTuple):
-    """How finely the walk divides the light, and which half vectors it covers.
-
-    Attributes
-    ----------
-    rules : (2, 5) float32
-        Greatest extent of a node relative to its distance from the mirror peak, greatest share of
-        the irradiance, greatest radius at the horizon, greatest radius, and half the width of the
-        narrowest peak. Lengths are in radians. The first row is for fragments of one or two
-        samples, the second for fragments of more, whose samples share the error.
-    low, high : float32
-        Bounds of sin(theta_h).
-    outline : float32
-        sin(theta_h) up to which leaves at the outline of an occluder cast rays of their own.
-    lobe : float32
-        sin(theta_h) within which the tables hardly change.
-    capacity : int
-        Most leaves of a group.
-    """
-
-    rules: Any
-    low: Any
-    high: Any
-    outline: Any
-    lobe: Any
-    capacity: Any
-
-
-class Questions(NamedTuple):
-    """Shadow rays that the walk asks for at the outlines of occluders, and their answers.
-
-    Attributes
-    ----------
-    ask : (groups, most, 3) float32
-        Directions of the rays, in the map's frame; the walk writes them.
-    answers : (groups, most) uint8
-        1 where light passes.
-    final : bool
-        Whether the answers are known. If not, groups with questions are left out.
-    """
-
-    ask: Any
-    answers: Any
-    final: Any
-
-
-class Tables(NamedTuple):
-    """Scalar tables on a grid of half and difference angles.
-
-    Attributes
-    ----------
-    n_h, n_d, n_p : int
-        Numbers of nodes along theta_h, theta_d and phi_d.
-    values : (n_h * n_d * n_p, T) float32
-        T tables. Without a column (T = 0), rows of the operator are computed, not radiance.
-    """
-
-    n_h: Any
-    n_d: Any
-    n_p: Any
-    values: Any
 
 
 class _Frame(NamedTuple):
@@ -482,8 +380,8 @@ def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _walk(
-    leaves: Any, ask: Any, answers: Any, frame: Any, tree: Any, masks: Any, wanted: Any,
-    pending: Any,
+    leaves: Any, ask: Any, answers: Any, frame: _Frame, tree: TreeArrays, masks: VisibilityMasks,
+    wanted: Any, pending: _Pending,
 ) -> Any:  # fmt: skip
     """Write the leaves of one group, and the shadow rays that it asks for.
 
@@ -695,7 +593,7 @@ def _arctan(y: Any, x: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _stencils(sample: Any, leaves: Any, count: Any, tables: Any, stencil: Any) -> None:
+def _stencils(sample: _Sample, leaves: Any, count: Any, tables: Tables, stencil: _Stencil) -> None:
     """Set the cells and interpolation weights of the first `count` leaves of a sample.
 
     The loop has no branches, so that the compiler vectorises it.
@@ -761,7 +659,13 @@ def _stencils(sample: Any, leaves: Any, count: Any, tables: Any, stencil: Any) -
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _collect(
-    whole: Any, found: Any, sample: Any, leaves: Any, count: Any, tables: Any, stencil: Any
+    whole: _Row,
+    found: Any,
+    sample: _Sample,
+    leaves: Any,
+    count: Any,
+    tables: Tables,
+    stencil: _Stencil,
 ) -> Any:
     """Add the first `count` leaves of one sample to a row.
 
@@ -805,7 +709,7 @@ def _collect(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _release(out: Any, whole: Any, found: Any, shown: Any) -> None:
+def _release(out: Any, whole: _Row, found: Any, shown: Tables) -> None:
     """Add a row, or its radiance under tables, to `out`; then clear the row.
 
     `out` is (3, T) radiance, or the row itself (3, cells) where the tables have no column.
@@ -843,7 +747,7 @@ def _release(out: Any, whole: Any, found: Any, shown: Any) -> None:
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def one_leaf(
-    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any, tables: Any
+    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any, tables: Tables
 ) -> None:
     """Add a light that is one leaf for every sample, such as a point light.
 
@@ -873,8 +777,8 @@ def one_leaf(
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def shade_rows(
-    out: Any, asked: Any, questions: Any, bundles: Any, tree: Any, masks: Any, settings: Any,
-    tables: Any,
+    out: Any, asked: Any, questions: Questions, bundles: Any, tree: TreeArrays,
+    masks: VisibilityMasks, settings: QuadratureSettings, tables: Tables,
 ) -> None:  # fmt: skip
     """Add the light of all groups of samples, a bundle of groups at a time.
 

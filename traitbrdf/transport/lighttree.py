@@ -57,7 +57,7 @@ class LightTree:
 
     @cached_property
     def packed(self) -> tuple[Float32, Float32, Int32, Int32]:
-        """Arrays for the compiled walk: the first four of `kernels.TreeArrays`."""
+        """Arrays for the compiled walk: the first four of `arrays.TreeArrays`."""
         place = np.zeros((len(self.radius), 8), np.float32)
         place[:, :3] = self.direction
         place[:, 3] = self.radius

@@ -43,16 +43,14 @@ from traitbrdf.directions import reflect
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.lights import EnvironmentMap, turn_about_y
 from traitbrdf.scene.scene import Scene
-from traitbrdf.transport.kernels import (
+from traitbrdf.transport.arrays import (
     QuadratureSettings,
     Questions,
     Tables,
     TreeArrays,
     VisibilityMasks,
-    interpolate_images,
-    one_leaf,
-    shade_rows,
 )
+from traitbrdf.transport.kernels import interpolate_images, one_leaf, shade_rows
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.visibility import (
     Bundles,
@@ -633,6 +631,5 @@ def core_of(grid: HalfDiffGrid, tables: Float32) -> float:
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
-_NO_MASKS = VisibilityMasks(
-    *(np.zeros(1, np.int32) for _ in range(2)), *(np.zeros((1, 1), np.uint64) for _ in range(3))
-)
+_NO_NODES, _NO_WORDS = np.zeros(1, np.int32), np.zeros((1, 1), np.uint64)
+_NO_MASKS = VisibilityMasks(_NO_NODES, _NO_NODES, _NO_WORDS, _NO_WORDS, _NO_WORDS)

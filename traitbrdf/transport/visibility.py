@@ -327,7 +327,7 @@ class Visibility:
 
     @property
     def masks(self) -> tuple[NDArray[np.uint64], ...]:
-        """The arrays `hidden`, `unseen` and `unhidden` of `kernels.VisibilityMasks`."""
+        """The arrays `hidden`, `unseen` and `unhidden` of `arrays.VisibilityMasks`."""
         return self._masks
 
     def cast(
