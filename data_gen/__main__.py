@@ -1,5 +1,4 @@
-"""``python -m data_gen``: rebuild the artifact that the package ships, or study embeddings
-and traits."""
+"""Run ``python -m data_gen``: rebuild the shipped artifact, or study embeddings and traits."""
 
 from __future__ import annotations
 
@@ -18,7 +17,17 @@ _SHIPPED = Path(__file__).resolve().parent.parent / "traitbrdf" / "data" / "libr
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m data_gen", description=__doc__)
+    """Run the command line, and return its exit status.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Left out, they are the process's own.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m data_gen",
+        description="Rebuild the artifact that the package ships, or study embeddings and traits.",
+    )
     parser.add_argument(
         "what", nargs="?", choices=("build", "study", "traits"), default="build",
         help="build the artifact, compare embeddings on measured materials, or tell of the traits "

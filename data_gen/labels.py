@@ -1,9 +1,9 @@
 """Traits: what each means, and labels of library members from descriptors of their tables.
 
-Never from the parameters of the recipes, and never from ratings: what a table looks like decides,
-so that a measured material would get the same label. A descriptor is graded by how common its value
-is among the members (`traitbrdf.space.scores.Grades`), which makes different units comparable; a
-trait's grade is a weighted sum of those. Names are the 16 of Matusik et al. 2003 and the 14 of
+Labels never use the parameters of the recipes, and never ratings: the look of a table decides, so
+that a measured material would get the same label. A descriptor is graded by how common its value is
+among the members (`traitbrdf.space.scores.Grades`), which makes different units comparable; a
+trait's value is a weighted sum of grades. Names are the 16 of Matusik et al. 2003, the 14 of
 Serrano et al. 2016, and "shiny".
 """
 
@@ -19,13 +19,19 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 
 SHARE = 1.0 / 3.0
-"""Members in the upper third of a trait's grade have it, in the lower third have it not."""
+"""Members in the upper third of a trait's values have it, those in the lower third do not."""
 
 
 class Definition(NamedTuple):
-    """A trait: what it means in a line, everyday names, and its grade from graded descriptors.
+    """A trait: its meaning in one line, everyday names, and weights of graded descriptors.
 
     A descriptor with a negative weight speaks against the trait.
+
+    Parameters
+    ----------
+    meaning : str
+    synonyms : tuple of str
+    weights : mapping of float, by descriptor
     """
 
     meaning: str
@@ -142,13 +148,29 @@ TRAITS: Mapping[str, Definition] = MappingProxyType(
 
 
 def grading() -> tuple[tuple[str, ...], Float64]:
-    """The descriptors that traits use, and their weights (traits, descriptors)."""
+    """Return the descriptors that traits use, and their weights.
+
+    Returns
+    -------
+    names : tuple of d str
+    weights : (traits, d) float64
+    """
     names = tuple(dict.fromkeys(name for d in TRAITS.values() for name in d.weights))
     weights = np.array([[d.weights.get(name, 0.0) for name in names] for d in TRAITS.values()])
     return names, weights
 
 
 def labels(values: Float64) -> NDArray[np.int8]:
-    """1 (yes) in the upper third, -1 (no) in the lower third, 0 (unclear) between."""
+    """Label members: 1 (yes) in the upper third, -1 (no) in the lower third, 0 (unclear) between.
+
+    Parameters
+    ----------
+    values : (n,) float64
+        Values of one trait.
+
+    Returns
+    -------
+    (n,) int8
+    """
     low, high = np.quantile(values, [SHARE, 1.0 - SHARE])
     return np.asarray((values >= high).astype(np.int8) - (values <= low).astype(np.int8))

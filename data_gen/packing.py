@@ -16,10 +16,11 @@ from data_gen.tables import Progress, Tables
 from traitbrdf.recipes.materials import materials
 from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.reflectance.descriptors import PROFILE, READINGS, describe, read, reading_rows
+from traitbrdf.space.definitions import Labelled
 from traitbrdf.space.embedding import GRID, BRDFEmbedding
 from traitbrdf.space.highlights import HIGHLIGHT
 from traitbrdf.space.logmap import channel_logs
-from traitbrdf.space.scores import Grades, Optics, Readings
+from traitbrdf.space.scores import Box, Grades, Optics, Readings
 from traitbrdf.space.traits import TraitSpace
 
 COUNT = 2040
@@ -35,22 +36,27 @@ def build(
     folder: Path | None = None,
     workers: int | str = 0,
 ) -> dict[str, NDArray[Any]]:
-    """Tabulate the recipe, fit the embedding and the traits; all arrays of the artifact.
+    """Tabulate the recipe, fit the embedding and the traits, and return all arrays of the artifact.
 
     Parameters
     ----------
-    count, seed : as for `traitbrdf.recipes.materials.materials`
-    components : as for `BRDFEmbedding`
-    progress : called with (stage, fraction); may raise to stop
-    folder : where tables are kept while they are needed, and after an interruption: 0.24 MB a
-        material; None is a temporary one
-    workers : as for `Tables.make`
+    count, seed : int
+        As for `traitbrdf.recipes.materials.materials`.
+    components : (int, int)
+        As for `BRDFEmbedding`.
+    progress : callable, optional
+        Called with (stage, fraction); it may raise to stop.
+    folder : Path, optional
+        Where tables are kept while they are needed, and after an interruption: 0.24 MB for each
+        material; a temporary one if left out.
+    workers : int or str
+        As for `Tables.make`.
 
     Notes
     -----
-    Memory does not grow with `count`, but for a kilobyte a material.
+    Memory grows by a kilobyte for each material only.
     """
-    embedding = BRDFEmbedding(components)  # bad numbers end here, before any work
+    embedding = BRDFEmbedding(components)  # raises on bad numbers, before any work
     if folder is None:
         with tempfile.TemporaryDirectory(prefix="traitbrdf-") as temporary:
             return build(count, seed, components, progress, Path(temporary), workers)
@@ -72,17 +78,17 @@ def build(
     names, weights = grading()
     grades = Grades.fit({name: described[name] for name in names})
     values = weights @ grades.of(np.stack(list(described.values()), axis=1)).T
-    marks = {name: labels(value) for name, value in zip(TRAITS, values, strict=True)}
+    marked = [
+        Labelled(name, labels(value), row, trait.meaning, trait.synonyms)
+        for (name, trait), value, row in zip(TRAITS.items(), values, weights, strict=True)
+    ]
     space = TraitSpace.fit(
         coordinates,
-        marks,
-        embedding.low_,
-        embedding.high_,
+        marked,
+        Box(embedding.low_, embedding.high_),
         tables.families,
-        embedding.body_rows(),
         Optics(few_cells(embedding, coordinates), grades),
-        weights,
-        {name: (trait.meaning, trait.synonyms) for name, trait in TRAITS.items()},
+        embedding.body_rows(),
     )
     report("traits", 1.0)
     return {
@@ -95,20 +101,27 @@ def build(
         "coordinates": coordinates,
         "descriptor_names": np.array(list(described)),
         "descriptors": np.stack(list(described.values()), axis=1).astype(np.float32),
-        "labels": np.stack([marks[name] for name in space.names]),
+        "labels": np.stack([trait.labels for trait in marked]),
     }
 
 
 ENERGY = (0, 9, 15)
-"""Angles of `brdf.ALBEDO_ANGLES` at which moves watch the albedo: 0, 48 and 80 degrees."""
+"""Indices of `brdf.ALBEDO_ANGLES` at which moves watch the albedo: 0, 48 and 80 degrees."""
 
 
 def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
-    """How readings are had of coordinates: those that take many cells, albedos and the flux into a
-    gloss meter, by few that give the same on the members.
+    """Choose few cells from which readings can be computed.
 
-    Cells and weights are found by non-negative least squares of relative errors (Lawson & Hanson
-    1974, chapter 23), so that nothing can come out negative.
+    Readings that take many cells (albedos, the flux into a gloss meter) are replaced by weighted
+    sums of few that give the same on the members. Cells and weights are found by non-negative least
+    squares of relative errors (Lawson & Hanson 1974, chapter 23), so that no reading can be
+    negative.
+
+    Parameters
+    ----------
+    embedding : BRDFEmbedding
+    coordinates : (n, k) array
+        Coordinates of the members.
     """
     grid = embedding.grid_
     albedos = albedo_operator(grid, np.asarray(ALBEDO_ANGLES)[list(ENERGY)]).toarray()
@@ -127,7 +140,7 @@ def few_cells(embedding: BRDFEmbedding, coordinates: NDArray[Any]) -> Readings:
             found, _ = nnls(relative[:, chosen], np.ones(len(relative)))
             rows[i] = 0.0
             rows[i, used[chosen]] = found
-    # the cells of the highlight, which decoding mends: all from the middle to its rim
+    # all cells from the middle of the highlight to its rim, since decoding corrects them
     count = len(READINGS)
     per = grid.n_theta_d * grid.n_phi_d
     first = READINGS.index("profile 0")

@@ -1,9 +1,9 @@
-"""Which embedding reaches real materials: mappings, weights, colour and dimensions compared.
+"""A comparison of embeddings on real materials: mappings, weights, colour and dimensions.
 
 Every candidate is a linear space of mapped tables, or several of them side by side (charts of a
-curved manifold), fitted to the same library; measured materials that the library knows nothing of
-are encoded into it by the same robust fit, and judged by the same errors: median
-|d log(f + 1e-3)| within 75 degrees of the normal, and what a sphere of them looks like.
+curved manifold), fitted to the same library. Measured materials that are not in the library are
+encoded by the same robust fit, and judged by the same errors: median |d log(f + 1e-3)| within 75
+degrees of the normal, and the look of a sphere made of them.
 """
 
 from __future__ import annotations
@@ -34,17 +34,18 @@ from traitbrdf.reflectance.measured import MeasuredBRDF
 from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import sphere
+from traitbrdf.space.definitions import straight
 from traitbrdf.space.embedding import GRID
 from traitbrdf.space.library import default_library
 from traitbrdf.space.logmap import FLOOR, OPPONENT
-from traitbrdf.space.traits import RELATED, default_traits, straight
+from traitbrdf.space.traits import RELATED, default_traits
 from traitbrdf.transport.operator import Operator
 
 Float64: TypeAlias = NDArray[np.float64]
 Float32: TypeAlias = NDArray[np.float32]
 
 HELD_OUT = 17
-"""Every so many-th member of the library is encoded, not fitted to."""
+"""Every 17th member of the library is encoded, and not fitted to."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,17 @@ class Candidate:
     Parameters
     ----------
     mapping : "log", "log-relative", "cube root" or "log1p twice"
-    colour : "apart" (mean of the channels and two differences), "channel" (one basis for each), or
-        "together" (one vector of all three)
-    components : of each; two numbers if apart
-    weight : "cosine" (square root of the lower one) or "even", of the cells above the horizon
+    colour : "apart", "channel" or "together"
+        The mean of the channels and two differences; one basis for each channel; or one vector of
+        all three.
+    components : tuple of int
+        Their number for each basis; two numbers if apart.
+    weight : "cosine" or "even"
+        Of the cells above the horizon: the square root of the lower cosine, or 1.
     grid : HalfDiffGrid
-    charts : spaces side by side, each fitted to the materials of a cluster; which one is a number
+    charts : int
+        Number of spaces side by side, each fitted to a cluster of materials. A material's chart
+        counts as a coordinate.
     """
 
     mapping: str = "log"
@@ -71,7 +77,7 @@ class Candidate:
 
     @property
     def numbers(self) -> int:
-        """k, of one material."""
+        """k, the number of coordinates of a material."""
         if self.colour == "apart":
             return self.components[0] + 2 * self.components[1] + (self.charts > 1)
         return self.components[0] * (3 if self.colour == "channel" else 1) + (self.charts > 1)
@@ -93,7 +99,9 @@ CANDIDATES: tuple[Candidate, ...] = (
     *(Candidate(components=(m, n)) for m, n in ((2, 1), (4, 2), (6, 3), (8, 4), (20, 8))),
     *(Candidate("log-relative", "channel", (m,)) for m in (1, 2, 3, 5, 8, 12)),
 )
-"""The default first; last, errors against k beside plain log-relative PCA (Nielsen et al. 2015)."""
+"""The default first; the last ones show errors against k beside plain log-relative PCA (Nielsen et
+al. 2015).
+"""
 
 
 _Map: TypeAlias = Callable[[Any, Any, Any], Any]
@@ -111,7 +119,7 @@ _MAPPINGS: dict[str, tuple[_Map, _Map]] = {
         lambda y, w, b: np.expm1(np.expm1(np.clip(y, 0.0, 3.3))),
     ),
 }
-"""y of f, and f of y; w and b are of the cell."""
+"""Functions y of f, and f of y; w and b are values for each cell."""
 
 
 class Space:
@@ -145,8 +153,21 @@ class Space:
             self._design = np.concatenate([t[None, :, None] * b[:, None] for t, b in parts])
 
     def encode(self, known: MeasuredSet) -> Iterator[tuple[float, Float64, Float64]]:
-        """Of every material of a set: what the fit leaves, log(f + FLOOR) (3, n) where it was
-        given, and f (3, cells)."""
+        """Encode every material of a set.
+
+        Parameters
+        ----------
+        known : MeasuredSet
+
+        Yields
+        ------
+        left : float
+            Mean absolute error of the mapped values.
+        (3, n) float64
+            Log(f + FLOOR) at the measured angles.
+        (3, cells) float64
+            f.
+        """
         index, corner = self.grid.stencil(*known.angles)
 
         def at(cells: Float64) -> Float64:
@@ -265,13 +286,27 @@ def study(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Iterator[tuple[Candidate, dict[str, float]]]:
-    """Each candidate with its errors: medians over materials of the median over their cells.
+    """Compare candidates: medians over materials of the median error over their cells.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+    count : int
+        Members of the library.
+    data : Path or None
+        Folder of measured materials; held-out members alone without it.
+    seed : int
+        Of the recipe.
+    progress : callable, optional
+        Called with (stage, fraction); it may raise to stop.
 
     Yields
     ------
-    candidate, and "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL",
-    "PSNR, dB" and "FLIP" (of the RGL materials on a sphere under three maps): those for which there
-    is data
+    Candidate
+    dict of float
+        "held out", "MERL", "MERL, 90th", "MERL, peak" (theta_h below 10 degrees), "RGL", "PSNR, dB"
+        and "FLIP" (of the RGL materials on a sphere under three maps): those for which there is
+        data.
     """
     report = progress or (lambda stage, fraction: None)
     sets = [] if data is None else measured_sets(data, 16, 6)
@@ -317,7 +352,13 @@ _COLUMNS = ("mapping", "colour", "components", "k", "weight", "grid", "charts")
 
 
 def table(rows: Sequence[tuple[Candidate, dict[str, float]]]) -> str:
-    """The comparison as a Markdown table."""
+    """Format the comparison as a Markdown table.
+
+    Parameters
+    ----------
+    rows : sequence of (Candidate, dict of float)
+        Candidates and their errors by name, as `study` yields them.
+    """
     names = list(rows[0][1])
     lines = [
         "| mapping | colour | components | k | weight | grid | charts | "
@@ -337,12 +378,12 @@ def table(rows: Sequence[tuple[Candidate, dict[str, float]]]) -> str:
 
 
 def trait_table() -> str:
-    """Every shipped trait: what it means and reads, what it goes with, and how well straight
-    vectors and scores read off coordinates rank members that they were not fitted to.
+    """Describe every shipped trait, and how well scores rank members, in a Markdown table.
 
-    Rank correlations with the grades of the members' own tables: of the normal of a linear support
-    vector machine and of the difference of class means, on every fifth member after a fit to the
-    others' labels, and of the shipped scores, of which only the grades' scale is fitted.
+    Accuracy is the rank correlation with the grades of the members' own tables: of the normal of a
+    linear support vector machine and of the difference of class means, on every fifth member after
+    a fit to the others' labels, and of the shipped scores, of which only the grades' scale is
+    fitted.
     """
     library, space = default_library(), default_traits()
     assert space.optics is not None

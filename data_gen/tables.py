@@ -1,9 +1,9 @@
 """Tables of a recipe's members: made in pieces, kept on disk, and made only once.
 
-A piece is a file of 60 members' tables. Whoever makes pieces (this process, or workers of a Dask
-cluster that see the same folder) needs nothing but their range: every member is drawn by itself
-from the seed. What was interrupted goes on where it stopped, and the same seed gives the same
-files, whatever made them.
+A piece is a file of 60 members' tables. This process, or workers of a Dask cluster that see the
+same folder, make each from its range of members alone, since every member is drawn from the seed
+independently. Interrupted work is resumed, and the same seed gives the same files wherever they are
+made.
 """
 
 from __future__ import annotations
@@ -32,7 +32,13 @@ Progress = Callable[[str, float], None]
 
 
 def table_of(material: Material, grid: HalfDiffGrid) -> TabulatedBRDF:
-    """A member's table, of albedo 1 at most."""
+    """Tabulate a member, with albedo 1 at most.
+
+    Parameters
+    ----------
+    material : Material
+    grid : HalfDiffGrid
+    """
     table = TabulatedBRDF.from_model(material.model, grid, material.name)
     # interpolating a sharp lobe can add a percent of energy that its closed form has not
     excess = table.max_albedo()
@@ -42,7 +48,21 @@ def table_of(material: Material, grid: HalfDiffGrid) -> TabulatedBRDF:
 
 
 def write_piece(path: str, seed: int, start: int, stop: int, grid: HalfDiffGrid) -> str:
-    """Write the tables (stop - start, *grid.shape, 3) float32 of some members; its path."""
+    """Write the tables (stop - start, *grid.shape, 3) float32 of some members.
+
+    Parameters
+    ----------
+    path : str
+    seed : int
+    start, stop : int
+        The range of members.
+    grid : HalfDiffGrid
+
+    Returns
+    -------
+    str
+        The path.
+    """
     values = [table_of(material, grid).values for material in materials(seed, stop, start)]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.save(file, np.stack(values).astype(np.float32))
@@ -50,12 +70,14 @@ def write_piece(path: str, seed: int, start: int, stop: int, grid: HalfDiffGrid)
 
 
 class Tables:
-    """The tables of the first members of a recipe, as often as they are asked for.
+    """The tables of the first members of a recipe; they can be iterated over repeatedly.
 
     Parameters
     ----------
-    folder : where the pieces are; made if it does not exist
-    count, seed : as for `traitbrdf.recipes.materials.materials`
+    folder : Path
+        Where the pieces are; it is made if it does not exist.
+    count, seed : int
+        As for `traitbrdf.recipes.materials.materials`.
     grid : HalfDiffGrid
     """
 
@@ -84,7 +106,7 @@ class Tables:
         return self.folder / f"{self._key}-{start:07d}-{stop:07d}.npy"
 
     def missing(self) -> list[tuple[int, int]]:
-        """Ranges whose pieces are still to be made."""
+        """Return ranges whose pieces are still to be made."""
         return [pair for pair in self._ranges() if not self._path(*pair).is_file()]
 
     def make(self, workers: int | str = 0, progress: Progress | None = None) -> None:
@@ -93,9 +115,11 @@ class Tables:
         Parameters
         ----------
         workers : int or str
-            0 makes them here; more start a local Dask cluster of so many processes (the extra
-            ``dask``). Text is the address of a running scheduler, whose workers see the folder.
-        progress : called with (stage, fraction); may raise to stop, and what was made stays
+            0 makes them in this process; a positive number starts a local Dask cluster of so many
+            processes (the extra ``dask``). Text is the address of a running scheduler, whose
+            workers see the folder.
+        progress : callable, optional
+            Called with (stage, fraction). It may raise to stop; finished pieces stay.
 
         Raises
         ------
@@ -130,7 +154,7 @@ class Tables:
 
 
 def _key(seed: int, grid: HalfDiffGrid) -> str:
-    """What tables depend on: other recipes or models make other files."""
+    """Return a digest of all that tables depend on: other recipes or models make other files."""
     digest = hashlib.sha256(repr((seed, grid)).encode())
     for module in (looks, families, anchors, recipe, spectra, models, brdf):
         digest.update(inspect.getsource(module).encode())

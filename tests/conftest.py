@@ -17,14 +17,17 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import numpy as np
 import pytest
 from hypothesis import settings
+from sessions import over
 
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import sphere
 from traitbrdf.scene.teapot import teapot
+from traitbrdf.session.editing import EditSession
 from traitbrdf.space.library import default_embedding, default_library
 from traitbrdf.transport.basis import Training, training_tables
+from traitbrdf.transport.transport import Transport
 
 settings.register_profile("laws", deadline=None)  # how long a law takes is no law
 settings.load_profile("laws")
@@ -137,3 +140,34 @@ def training() -> Training:
     channels = [embedding.decode_values(z) for z in library.coordinates[::6]]
     whole = training_tables(np.concatenate(channels, axis=1), embedding.grid_)
     return Training(np.ascontiguousarray(whole.tables[:, ::3]), whole.weight[::3])
+
+
+@pytest.fixture
+def small_training(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sessions fit their bases to few materials."""
+    monkeypatch.setattr("traitbrdf.session.preparation.training_of", lambda library, seed: training)
+
+
+@pytest.fixture
+def types_take_as_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which number type is faster is measured: on a busy machine it comes out either way."""
+    monkeypatch.setattr("traitbrdf.session.budget.median_seconds", lambda *_: 1e-3)
+
+
+@pytest.fixture(scope="session")
+def prepared(small_teapot: Scene, training: Training) -> Transport:
+    """A teapot in few pixels, prepared for edits of all parts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("traitbrdf.session.preparation.training_of", lambda library, seed: training)
+        return EditSession(small_teapot, quality="preview", cache=False).prepare()
+
+
+@pytest.fixture
+def fresh(prepared: Transport) -> Callable[..., EditSession]:
+    """Makes new sessions over one prepared scene; they do without exact frames unless asked."""
+    return lambda **arguments: over(prepared, **{"error": 1.0, **arguments})
+
+
+@pytest.fixture
+def edit(fresh: Callable[..., EditSession]) -> EditSession:
+    return fresh()

@@ -106,7 +106,7 @@ def test_stencil_reproduces_node_values(grid):
 @given(half_circle, half_circle, azimuth)
 @settings(deadline=None)
 def test_stencil_reproduces_linear_functions(grid, th, td, pd):
-    # between the last node and the far end of an axis a MERL table is clamped
+    # a MERL table is clamped between the last node and the end of an axis
     ah, ad = min(th, grid.theta_h[-1]), min(td, grid.theta_d[-1])
     nodes = grid.node_angles()
     index, weight = grid.stencil(th, td, pd)
@@ -222,7 +222,7 @@ def test_albedo_of_lambert_is_k_d_at_every_angle(grid):
 
 
 def brute_force_albedo(f, theta, n=400):
-    """Midpoint rule over the light's own angles: another quadrature than the package's."""
+    """The midpoint rule over the light's angles, a different quadrature from the package's."""
     t, p = np.meshgrid((np.arange(n) + 0.5) / n * HALF_PI, (np.arange(n) + 0.5) / n * math.pi)
     wi = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
     weight = np.cos(t) * np.sin(t) * (HALF_PI / n) * (math.pi / n) * 2.0

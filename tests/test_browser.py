@@ -216,7 +216,7 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         assert driver.state()["edits"] == 2
         # the very pixels of the frame
         frame = session.edit.render(exact=False)
-        np.testing.assert_array_equal(driver.pixels(), session._display(frame))
+        np.testing.assert_array_equal(driver.pixels(), session.display(frame))
         # a second tab shows the same, and what the first does next
         second = page.context.new_page()
         second.goto(server.url)

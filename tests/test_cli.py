@@ -14,7 +14,7 @@ from PIL import Image
 import traitbrdf as tb
 from traitbrdf.bench import datasets, peers
 from traitbrdf.bench.datasets import HELD_OUT, unseen
-from traitbrdf.bench.edits import _frame_error, _peak_memory
+from traitbrdf.bench.edits import frame_error, peak_memory
 from traitbrdf.bench.oracle import Oracle, draw_fragments, reference_values
 from traitbrdf.bench.records import ON_REQUEST, Record
 from traitbrdf.bench.rivals import texel_sum, texel_sum_torch
@@ -92,7 +92,7 @@ def test_paint_writes_a_picture_and_a_design(
 
 @pytest.mark.slow
 def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As a flag, with a radius, or none; it is a part of its own and saved with the design."""
+    """Given as a flag, with a radius, or not; the ground is a part and is saved with the design."""
 
     def shown(*arguments: str) -> np.ndarray:
         out = tmp_path / "x.exr"
@@ -192,7 +192,7 @@ def test_bench_writes_records(
         assert {"name", "value", "unit", "target", "met", "error", "how"} == set(record)
         assert np.isfinite(record["value"])
         assert (record["target"] is None) == (record["met"] is None)
-        if record["unit"] == "ms":  # what is timed was checked
+        if record["unit"] == "ms":  # a timed result was checked
             assert 0.0 < record["error"] < 0.05
     named = {record["name"] for record in records}
     assert set(expected) <= named
@@ -255,7 +255,7 @@ def test_the_oracle_on_several_cores_is_the_same() -> None:
     scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=12, subsamples=2)
     brdfs = [tb.default_library()[name] for name in ("white-plaster", "gold-satin")]
     index = np.arange(0, len(scene.pixels), len(scene.pixels) // 40)
-    assert len(index) >= 32  # fewer are not shared out
+    assert len(index) >= 32  # fewer are computed in one process
     values, errors = reference_values(scene, index, brdfs, 1e-2)
     expected = tb.reference.fragments(scene, index, brdfs, 1e-2)
     np.testing.assert_array_equal(values, expected[0])
@@ -292,7 +292,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
     session = tb.EditSession(scene, quality="preview")
     session.assign("sphere", "white-plaster")
     frame = session.render()
-    stated = _frame_error(session, len(scene.pixels), np.random.default_rng(0))
+    stated = frame_error(session, len(scene.pixels), np.random.default_rng(0))
     brdfs = {name: session.brdf(name) for name in scene.parts}
     true = tb.reference.render(scene, brdfs, 1e-3).reshape(-1, 3)
     backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
@@ -305,7 +305,7 @@ def test_frame_errors_are_those_of_whole_pixels() -> None:
 
 
 def test_peak_memory() -> None:
-    peak = _peak_memory()
+    peak = peak_memory()
     assert peak is None or 0.05 < peak < 100.0
 
 
@@ -365,7 +365,7 @@ def test_mitsuba_is_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in BENCHES:
 
         def noted(*_: object, name: str = name) -> Iterator[Record]:
-            """Nothing is measured."""
+            """Measure nothing."""
             called.append(name)
             return iter(())
 

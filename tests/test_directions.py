@@ -51,10 +51,10 @@ def test_half_difference_angles_round_trip(theta_h, theta_d, phi_d, phi_h):
     wi, wo = from_half_diff_angles(theta_h, theta_d, phi_d, phi_h)
     np.testing.assert_allclose([wi @ wi, wo @ wo], 1.0, atol=1e-14)
     th, td, pd = half_diff_angles(wi, wo)
-    # wi + wo loses the length that theta_d takes from it
+    # wi + wo is short at large theta_d, which costs digits
     assert abs(th - theta_h) < 1e-15 / math.cos(theta_d) + 1e-15
     assert abs(td - theta_d) < 1e-14
-    # an azimuth means the less, the nearer its pole
+    # an azimuth matters less close to its pole
     assert turn(pd, phi_d) * math.sin(theta_d) * math.sin(theta_h) < 1e-14 / math.cos(theta_d)
 
 
@@ -79,7 +79,7 @@ def test_small_angles_survive_in_float32(theta_h):
         assert array.dtype == np.float32
     np.testing.assert_allclose(th, theta_h, atol=6e-7)
     np.testing.assert_allclose(td, theta_d, atol=6e-7)
-    if theta_h < 1e-4:  # the arc cosine would have lost it
+    if theta_h < 1e-4:  # the arc cosine cannot resolve it
         h = (wi + wo)[..., 2] / np.linalg.norm(wi + wo, axis=-1)
         assert np.median(np.abs(np.arccos(np.minimum(h, 1)) - theta_h)) >= 0.9 * theta_h
 
@@ -102,7 +102,7 @@ def test_turning_both_about_the_normal_changes_nothing(wi, wo, angle):
     r = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     th, td, pd = half_diff_angles(wi, wo)
     th2, td2, pd2 = half_diff_angles(r @ wi, r @ wo)
-    if math.cos(td) < 1e-5:  # the half vector is next to undefined
+    if math.cos(td) < 1e-5:  # the half vector is nearly undefined
         return
     assert abs(th2 - th) < 1e-9
     assert abs(td2 - td) < 1e-9

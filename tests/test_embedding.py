@@ -78,7 +78,7 @@ def axes(z):
 
 def decent(logs):
     """What `profiles` says of log f (cells, 3), in float64."""
-    known = EMBEDDING._profiles
+    known = EMBEDDING.profiles_
     x = np.array(logs, np.float64).reshape(GRID.n_theta_h, -1, 3)
     profile = np.arange(x.shape[1])
     trend = np.maximum(x[known.last, profile] - x[: known.core].max(axis=0), 0.0)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from traitbrdf import reference
-from traitbrdf.bench.trade import _sheet
+from traitbrdf.bench.trade import surface_mesh
 from traitbrdf.directions import latlong_to_direction, to_local
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.reflectance.models import GGX, BoundedPhong, Lambert
@@ -36,7 +36,7 @@ LIBRARY = default_library()
 
 
 def tabulated(model, bounded=True):
-    """A model's table, lowered until it reflects no more light than arrives if `bounded`.
+    """A model's table, scaled down to an albedo of at most 1 if `bounded`.
 
     Between its nodes a table is linear, a model is not: the peak of roughness 1e-4 has more in it.
     """
@@ -82,11 +82,11 @@ def ball_mesh(rings=24):
     phi = np.linspace(0.0, 2.0 * math.pi, 2 * rings + 1)
     t, p = np.meshgrid(theta, phi, indexing="ij")
     points = np.stack([np.sin(t) * np.sin(p), np.cos(t), np.sin(t) * np.cos(p)], axis=-1)
-    return _sheet(points, points, "ball")
+    return surface_mesh(points, points, "ball")
 
 
 def finite(values):
-    """Nothing that is not a number, and no negative light."""
+    """Check for NaN and negative light."""
     found = np.asarray(values)
     assert np.isfinite(found).all()
     assert found.min() >= 0.0
@@ -130,7 +130,7 @@ def test_shadows_only_take_away():
 
 
 def test_peaks_of_1e8_and_zeros():
-    """The brightest cell that MERL's format can tell of, alone in a table of zeros."""
+    """The brightest cell that MERL's format can store, in a table of zeros."""
     values = np.zeros((*GRID.shape, 3), np.float32)
     values[0] = 1e8
     table = TabulatedBRDF(GRID, values)
@@ -150,7 +150,7 @@ def test_peaks_of_1e8_and_zeros():
 
 @pytest.mark.parametrize("name", ["GGX 1e-4", "Phong 1e6"])
 def test_a_session_shows_needles(name):
-    """Tables far sharper than any that a basis is fitted to are seen to leave it."""
+    """The error of tables far sharper than the training set is noticed."""
     scene = Scene(sphere(), EnvironmentMap.uniform(0.5), size=16)
     session = EditSession(scene, quality="reference", cache=False)
     session.assign("sphere", SHARP[name])
@@ -168,7 +168,7 @@ def test_a_session_shows_needles(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["GGX 0.01", "GGX 0.1", "GGX 1", "Lambert"])
 def test_a_sun_of_one_texel_beside_a_dark_sky(name):
-    """1e6 beside 1e-4: the sun's light is right, and the sky is still there where it is not."""
+    """A sun of 1e6 and a sky of 1e-4: both are right."""
     image = np.full((64, 128, 3), 1e-4)
     image[18, 70] = 1e6
     scene = Scene(sphere(), EnvironmentMap(image), camera=Camera.orbit(10.0, 20.0), size=32)
@@ -209,7 +209,7 @@ def test_a_map_of_one_texel_is_a_furnace():
 
 
 def test_blocks_of_texels_shine_as_their_texels():
-    """Above some rows a leaf of the tree is a block; what is cut from it are its own texels."""
+    """In large maps a leaf of the tree is a block of texels, which the walk cuts further."""
     rng = np.random.default_rng(0)
     image = 0.1 + rng.random((300, 602, 3)) ** 8
     image[100, 217] = 1e4
@@ -232,7 +232,7 @@ def test_blocks_of_texels_shine_as_their_texels():
 
 @pytest.mark.slow
 def test_a_map_of_8192_by_4096():
-    """The largest that studios sell: with a sun of one texel, and a floor of light below it."""
+    """The largest maps on the market, with a one-texel sun and a bright floor."""
     rows = 4096
     image = np.empty((rows, 2 * rows, 3), np.float32)
     image[:] = np.linspace(0.2, 1.0, rows, dtype=np.float32)[:, None, None]
@@ -258,7 +258,7 @@ def floor():
 @pytest.mark.parametrize("light", [0.0, 45.0, 89.99])
 @pytest.mark.parametrize("view", [0.0, 60.0, 89.99])
 def test_grazing_light_and_view(view, light):
-    """Closed form: irradiance times f and the cosine. Light exactly at the view as well."""
+    """Exact: irradiance times f and the cosine. Includes light exactly at the view."""
     black = EnvironmentMap(np.zeros((2, 4, 3)))
     t = math.radians(light)
     sun = DirectionalLight((0.0, math.cos(t), math.sin(t)), (2.0, 2.0, 2.0))
@@ -271,14 +271,14 @@ def test_grazing_light_and_view(view, light):
     sample, owner, share = scene.samples(index)
     toward = np.broadcast_to(np.asarray(sun.direction), (len(sample), 3))
     wi, wo = (to_local(w, scene.normals[sample]) for w in (toward, scene.views[sample]))
-    # a scene lets no surface be seen flatter than at 89.43 degrees
+    # a scene shows no surface at more than 89.43 degrees to its normal
     assert np.degrees(np.arccos(wo[:, 2])) == pytest.approx(min(view, 89.427), abs=0.1)
     for name, table in SHARP.items():
         shown = finite(Operator(scene, GRID).images(index, column(table))[:, 1, 0])
         f = table.eval(wi, wo)[:, 1] * np.maximum(wi[:, 2], 0.0)
         expected = np.bincount(owner, share * f * 2.0, minlength=len(index))
         if name in ("GGX 1e-4", "GGX 1e-3", "Phong 1e6"):
-            # float32 has an angle of 1e-4 to some percent: the sum, not each pixel
+            # float32 resolves an angle of 1e-4 to some percent: compare the sum, not each pixel
             assert shown.sum() == pytest.approx(expected.sum(), rel=0.05, abs=1e-6)
         else:
             np.testing.assert_allclose(shown, expected, rtol=5e-3, atol=1e-5 * (1 + expected.max()))
@@ -289,7 +289,7 @@ def test_grazing_light_and_view(view, light):
 
 @pytest.mark.parametrize("amount", [100.0, -100.0])
 def test_traits_by_a_hundred(amount):
-    """The move ends where the library does, or, if told to go on, at the walls of the box."""
+    """The move ends at the limits of the library, or at the walls of the box if allowed."""
     space, embedding = default_traits(), default_embedding()
     start = LIBRARY.coordinates[LIBRARY.names.index("blue-plastic")]
     for name in space.names:
@@ -338,7 +338,7 @@ def test_half_precision_stores(training, dtype, allowed):
 
 
 def test_a_store_of_half_precision_learns(training):
-    """What leaves the span is taken into the basis, which stays in its type and as exact."""
+    """The basis learns frames outside its span, and keeps its type and accuracy."""
     scene = Scene(sphere(), EnvironmentMap.sky(rows=32), size=28)
     half = Transport(scene, GRID, training, rank=16).stored(torch.float16)
     table = np.ascontiguousarray(SHARP["GGX 0.01"].values.reshape(-1, 3), np.float32)
@@ -383,7 +383,7 @@ def test_an_image_of_4096_by_4096():
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_the_size_of_the_world_does_not_matter(scale):
-    """Shape and lamps a million times larger or smaller: the same picture, shadows and all."""
+    """Scaling shape and lamps by a million does not change the picture."""
     shape = teapot(8)
 
     def world(s):
@@ -405,6 +405,6 @@ def test_the_size_of_the_world_does_not_matter(scale):
             )
             for scene in (other, one)
         )
-        # a shadow ray that grazes an edge may fall to either side
+        # a shadow ray that grazes an edge may pass on either side
         close = np.isclose(shown, expected, rtol=1e-3, atol=1e-6).all(axis=(1, 2))
         assert np.mean(close) > 0.995

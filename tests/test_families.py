@@ -181,7 +181,7 @@ def test_metals_seen_by_an_observer(name):
 
 @pytest.mark.parametrize("name", SPECTRA)
 def test_indices_have_the_curve_of_the_spectrum(name):
-    """Also at angles that the fit did not see."""
+    """Also at angles that were not part of the fit."""
     cosines = np.linspace(0.1, 1.0, 19)
     eta, k = (np.array(v) for v in METALS[name])
     shown = fresnel_conductor(cosines[:, None], eta, k)

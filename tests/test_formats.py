@@ -257,7 +257,7 @@ def test_exr_truncated_anywhere_is_refused_silently(tmp_path, capfd):
 
 
 def test_exr_damaged_pixels_are_refused(tmp_path, capsys):
-    smooth = np.linspace(0, 1, 40 * 17 * 3).reshape(40, 17, 3)  # noise would stand uncompressed
+    smooth = np.linspace(0, 1, 40 * 17 * 3).reshape(40, 17, 3)  # noise would be stored uncompressed
     write_exr(tmp_path / "a.exr", smooth)
     data = bytearray((tmp_path / "a.exr").read_bytes())
     (offset,) = struct.unpack_from("<Q", data, data.index(b"scanlineimage\0") + 14)
@@ -316,7 +316,7 @@ def test_real_maps_read(shared_data):
 
 
 def rgbe(height: int, width: int, seed: int = 1) -> np.ndarray:
-    """Random pixels with runs in them, none of which looks like a marker."""
+    """Random pixels with runs, none of which looks like a marker."""
     rng = np.random.default_rng(seed)
     pixels = rng.integers(128, 256, (height, width, 4)).astype(np.uint8)
     pixels[..., 3] = rng.integers(120, 140, (height, width))
@@ -472,7 +472,7 @@ def test_srgb_refuses_nan_and_other_shapes():
 
 def test_merl_round_trip_and_layout(tmp_path):
     values = np.random.default_rng(0).random((4, 3, 5, 3)) * 100.0
-    values[1, 2, 3] = -1.0  # invalid cells stay what they are
+    values[1, 2, 3] = -1.0  # invalid cells do not change
     path = tmp_path / "a.binary"
     write_merl(path, values)
     np.testing.assert_allclose(read_merl(path), values, rtol=4e-16)
@@ -617,7 +617,7 @@ def test_rgl_real_files(shared_data):
 
 @pytest.mark.parametrize("kind", ["exr", "hdr", "binary", "bsdf"])
 def test_damaged_bytes_end_in_format_error(tmp_path, tensor_writer, rgl_fields, kind):
-    """Random damage to headers and bodies either still reads or is refused by name."""
+    """A randomly damaged file can still be read, or is refused with an error that names it."""
     path = tmp_path / f"a.{kind}"
     read: Callable[[Path], object] = read_image
     if kind == "exr":

@@ -1,8 +1,10 @@
-"""The floors of the house: which room may import which. Adding a room means adding it here."""
+"""The layers of the package: which room may import which. Add new rooms here."""
 
 from __future__ import annotations
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -25,19 +27,16 @@ FLOORS = (
     ("bench", "studio"),
     ("cli",),
 )
-"""Rooms and single modules; each imports only from floors before its own."""
+"""Rooms and single modules; each imports only from earlier floors."""
 
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-ARRAYS_ONLY = ("design",)
-"""Rooms that know no BRDF and no scene: they import the ground floor alone."""
-
 LONGEST = 900
 LONGER = {"reflectance/models.py"}
-"""Lines of a file, and files that are a list of many things of one kind."""
+"""Greatest length of a file, and the exception: a list of many things of one kind."""
 
 HOMES = {
     "OpenEXR": {"formats/images.py"},
-    "sklearn": {"space/embedding.py", "space/traits.py"},
+    "sklearn": {"space/fitting.py", "space/definitions.py"},
     "embreex": {"scene/shapes.py"},
     "trimesh": {"scene/shapes.py", "scene/meshes.py"},
     "numba": {
@@ -45,7 +44,7 @@ HOMES = {
         "transport/kernels.py",
     },
 }  # fmt: skip
-"""Where else's package may be imported."""
+"""Files that may import an outside package."""
 
 
 def module_of(path: Path) -> str:
@@ -54,7 +53,7 @@ def module_of(path: Path) -> str:
 
 
 def imports(source: str, package: str) -> set[str]:
-    """Dotted names of all that is imported anywhere, under TYPE_CHECKING and in functions too.
+    """Dotted names of all imports, including those under TYPE_CHECKING and in functions.
 
     `from a import b` counts as a.b, since b may be a module; `package` resolves relative imports.
     """
@@ -118,14 +117,14 @@ def test_imports_go_down(path):
     assert own in FLOOR, f"add {own} to FLOORS"
     names = house_imports(path) - {own}
     if FLOOR[own] == len(FLOORS) - 1:
-        names -= {""}  # the public names stand above all but the command line
+        names -= {""}  # only the command line may import the public names
     for name in names:
         assert name in FLOOR, f"{own} imports traitbrdf.{name}, which is on no floor"
         assert FLOOR[name] < FLOOR[own], f"{own} imports {name} from its own or a higher floor"
 
 
 def test_imports_within_a_room_make_no_circle():
-    """Files of a room stand one above the other, too."""
+    """The files of a room are layered, too."""
     known = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files()}
     below = {}
     for name, path in known.items():
@@ -135,9 +134,12 @@ def test_imports_within_a_room_make_no_circle():
 
 
 @everywhere
-def test_array_modules_know_no_brdf(path):
-    if module_of(path) in ARRAYS_ONLY:
-        assert house_imports(path) <= set(FLOORS[0])
+def test_the_document_is_plain_values(path):
+    """It shades nothing and starts no thread."""
+    if module_of(path) == "design":
+        outside = {name.split(".")[0] for name in imports_of(path)}
+        assert not outside & {"torch", "threading", "numba", "concurrent"}
+        assert not house_imports(path) & {"transport", "reference", "pictures"}
 
 
 @everywhere
@@ -202,7 +204,7 @@ def test_public_names_are_few_and_listed():
     ]
     assert len(listed) == 1, "__init__.py has to state __all__ once"
     names = listed[0]
-    assert len(names) == len(set(names)) <= 25
+    assert len(names) == len(set(names)) <= 25  # beside effects
     bound = {
         alias.asname or alias.name
         for node in ast.walk(tree)
@@ -217,6 +219,7 @@ def test_materials_and_traits_do_not_wait_for_torch():
         "import sys, traitbrdf as tb\n"
         "z = tb.default_library().coordinates[0]\n"
         "tb.default_traits().move(tb.default_embedding().clip(z), {'shiny': 0.1})\n"
+        "from traitbrdf.design import document, storage\n"
         "assert not {'torch', 'sklearn'} & set(sys.modules)\n"
         "assert tb.EditSession is tb.EditSession and 'torch' in sys.modules\n"
         "from traitbrdf.studio import session\n"
@@ -237,3 +240,17 @@ def test_info_does_not_wait_for_torch():
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_walk_from_the_mouse_to_the_pixel_goes_down():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    section = text.split("## A stroke")[1].split("##")[0]
+    walk = [PACKAGE.parent / name for name in re.findall(r"`(traitbrdf/[\w/.]+)`", section)]
+    assert 5 <= len(walk) <= 8
+    assert all(path.is_file() for path in walk)
+    floors = [FLOOR[module_of(path)] for path in walk]
+    assert floors == sorted(floors, reverse=True)
+    for above, path in itertools.pairwise(walk):
+        if path.suffix == ".py":
+            name = ".".join(above.relative_to(ROOT).with_suffix("").parts)
+            assert not any(f"{found}.".startswith(f"{name}.") for found in imports_of(path))

@@ -140,7 +140,7 @@ def test_rotation_is_counter_clockwise_seen_from_above():
 def test_rotating_map_and_direction_together_changes_nothing(first, second, seed):
     environment = random_map((5, 8), seed)
     w = random_directions(50, seed)
-    # a direction within rounding of a border may fall to either side
+    # a direction at a border may round to either side
     u, v = direction_to_latlong(w)
     inside = (np.abs((u * 8 + 0.5) % 1 - 0.5) > 1e-6) & (np.abs((v * 5 + 0.5) % 1 - 0.5) > 1e-6)
     w = w[inside]
@@ -201,7 +201,7 @@ def test_scaling_by_number_and_colour():
 def test_the_map_is_its_own_and_frozen():
     given_array = np.ones((2, 4, 3), np.float32)
     environment = EnvironmentMap(given_array)
-    given_array[0, 0] = 5.0  # still the caller's to write
+    given_array[0, 0] = 5.0  # the caller may still write to it
     assert environment.image.max() == 1.0
     with pytest.raises(ValueError, match="read-only"):
         environment.image[0, 0] = 5.0
@@ -396,7 +396,7 @@ def test_light_tree_keeps_a_dim_sky_beside_a_bright_sun():
     environment = EnvironmentMap(image)
     tree = LightTree.build(environment)
     sky, node = np.zeros((3, 3)), 0
-    while np.any(tree.child[node] >= 0):  # down to the sun, gathering what lies beside the way
+    while np.any(tree.child[node] >= 0):  # descend to the sun, collecting the siblings on the way
         on_way = -1
         for child in tree.child[node]:
             r0, r1, c0, c1 = tree.rectangle[child]
@@ -412,7 +412,7 @@ def test_light_tree_keeps_a_dim_sky_beside_a_bright_sun():
 
 
 def test_light_tree_spread_of_uniform_light():
-    # over the whole sphere the mean direction vanishes: its variance is all there is
+    # over the whole sphere the mean direction is zero, so only its variance remains
     tree = LightTree.build(EnvironmentMap.uniform(rows=8))
     assert abs(tree.spread[0] - math.sqrt(0.5)) < 1e-4
     leaf = np.all(tree.child < 0, axis=1)
@@ -480,7 +480,7 @@ def smooth(w):
 
 
 def probe(layout, size=256):
-    """What a camera would have recorded: direction by pixel, by the definition of the layout."""
+    """A camera's picture: the direction of each pixel, by the definition of the layout."""
     x = (np.arange(size) + 0.5) / size * 2.0 - 1.0
     x, y = np.meshgrid(x, -x)
     r = np.hypot(x, y)
@@ -503,6 +503,6 @@ def test_probes_are_unwrapped(tmp_path, layout):
     assert environment.image.shape == (128, 256, 3)
     error = np.abs(environment.image / smooth(texel_centres(128, 256)) - 1.0)
     assert error.mean() < 3e-3
-    # all of the rim is one direction: its neighbourhood is hardly sampled
+    # the whole rim is one direction, whose neighbourhood has few samples
     blind = texel_centres(128, 256)[..., 2] < -0.98 if layout == "mirrorball" else None
     assert error[~blind if blind is not None else ...].max() < 0.03

@@ -87,7 +87,7 @@ def test_lambert_written_as_a_measurement(tmp_path, tensor_writer, rgl_fields):
     expected = np.array([0.8, 0.4, 0.1]) / math.pi
     np.testing.assert_allclose(brdf.eval(wi, wo) / expected, 1.0, atol=0.02)
     np.testing.assert_allclose(albedo_of(brdf.eval, 0.5), [0.8, 0.4, 0.1], rtol=0.02)
-    # two azimuths, as some files of isotropic materials might have, change nothing
+    # a second azimuth, which some files of isotropic materials may have, changes nothing
     doubled = dict(rgl_fields, phi_i=np.array([0.0, 1.0], np.float32))
     for name in ("vndf", "luminance", "rgb"):
         doubled[name] = np.repeat(rgl_fields[name], 2, axis=0)

@@ -66,7 +66,7 @@ MODELS: tuple[type[Model], ...] = (
 RECIPROCAL = [cls for cls in MODELS if cls.reciprocal]
 BOUNDED = [cls for cls in MODELS if cls.energy_bounded]
 
-# resolves lobes down to a width of 1e-4, where the nodes of a table do not
+# a grid that resolves lobes of width 1e-4, unlike the nodes of a table
 FINE = np.unique(
     np.concatenate(
         [[0.0], np.geomspace(1e-6, 0.05, 60), (np.arange(1, 60) / 59) ** 2 * math.pi / 2]
@@ -92,7 +92,7 @@ def random_directions(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def values_of(parameter):
-    """Any legal value of a parameter, log-spaced where it asks for that."""
+    """Any legal value of a parameter, log-spaced if the parameter is."""
     if parameter.log:
         low, high = math.log(parameter.low), math.log(parameter.high)
         one = st.floats(low, high).map(
@@ -247,7 +247,7 @@ def test_anisotropic_lobe_does_not_make_energy():
 def test_known_weaknesses_of_the_source():
     phong = NormalizedPhong(1.0, 10.0)
     assert not phong.energy_bounded
-    # the light that leaves, for light from 89 degrees: the view-side albedo stays below 1
+    # the reflected share of light from 89 degrees; the albedo by view stays below 1
     leaving = albedo_of(lambda wi, wo: phong.eval(wo, wi), math.radians(89.0))
     np.testing.assert_allclose(leaving, 6.93, atol=0.01)
     assert albedo(phong, 89.0).max() < 1.0
@@ -318,10 +318,10 @@ LOBES = (BlinnPhong, Beckmann, GTR, ABC, ShiftedGamma)
 @settings(max_examples=60, deadline=None)
 @given(models(LOBES))
 def test_densities_of_half_vectors_integrate_to_one(lobe):
-    """By another rule than the one that norms them."""
+    """Integrated by a different rule from the one that computes their norm."""
     theta = np.concatenate([[0.0], np.geomspace(1e-7, 0.5 * math.pi, 40_001)])
-    density = lobe._shape(np.sin(theta) ** 2) / lobe._norm
-    # the steps of a solid angle are exact; the density is taken at both ends of each
+    density = lobe.density(theta)
+    # the solid angles are exact; the density is averaged over both ends of each
     steps = 2.0 * math.pi * -np.diff(np.cos(theta))
     steps[theta[1:] < 1e-3] = math.pi * np.diff(theta**2)[theta[1:] < 1e-3]
     assert (0.5 * (density[1:] + density[:-1])) @ steps == pytest.approx(1.0, rel=2e-4)

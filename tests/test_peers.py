@@ -55,7 +55,7 @@ MODELS = {
 
 @pytest.fixture
 def peer():
-    """Skips without Mitsuba, save where CI=true: there the check must not vanish unseen."""
+    """Skip without Mitsuba, except with CI=true, where the check must not vanish silently."""
     try:
         return peers.load()
     except RuntimeError as error:
@@ -159,7 +159,7 @@ def test_maps_are_turned_alike(peer):
     seen = dr.zeros(mi.SurfaceInteraction3f, len(w))
     seen.wi = mi.Vector3f(-w.T.astype(np.float32))
     theirs, ours = np.array(emitter.eval(seen)).T, environment.radiance(w)
-    # all but the ramps: 1/32 of a texel at either side of its four edges
+    # all but the ramps: 1/32 of a texel on both sides of its four edges
     same = np.all(np.abs(theirs - ours) <= 1e-4 * ours, axis=-1)
     assert np.mean(same) > 0.85
     sun = environment.image.max()
@@ -181,7 +181,7 @@ def test_cameras_see_alike(peer, name):
 
 
 def test_an_edit_is_another_table_and_compiles_nothing(peer):
-    """What stands beside our edits: it must be the table asked for, at no cost but its samples."""
+    """Mitsuba must render the assigned table, at no cost but its samples."""
     scene = make_scene("teapot")
     pixels = scene.pixels[inner_fragments(scene, 40)]
     before, after = (
@@ -207,13 +207,13 @@ def test_an_edit_is_another_table_and_compiles_nothing(peer):
 
 
 def test_launches_do_not_share_random_numbers(peer, monkeypatch):
-    """A frame in several launches errs as one in a single launch does, and is no less random."""
+    """A frame in several launches has the same error as in one, and is as random."""
     scene = make_scene("teapot")
     pixels = scene.pixels[inner_fragments(scene, 60)]
     table = TabulatedBRDF.from_model(MODELS["glossy"][0], GRID)
     theirs = their_scene(peer.mi, scene, peer.material(table, *fit_lobe(table)))
     whole = traced(peer, theirs, scene, pixels, 4096, 0)
-    monkeypatch.setattr(peers, "_LAUNCH", 20 * 16)
+    monkeypatch.setattr(peers, "PATHS_AT_ONCE", 20 * 16)
     cut = np.stack([traced(peer, theirs, scene, pixels, 16, seed) for seed in range(64)])
     assert len(np.unique(cut[:, 0, 0])) == 64
     assert reference.relative_error(cut.mean(axis=0), whole) < 0.04
@@ -233,7 +233,7 @@ def test_the_number_of_samples_is_what_they_draw(peer):
 
 @pytest.mark.parametrize("name", ["boxes", "sphere", "ground", "teapot"])
 def test_radiance_is_theirs(peer, name):
-    """Of the ground only its own fragments: in our scenes it hides no light from the sphere."""
+    """Of the ground, compare only its own fragments: ours hides no light from the sphere."""
     scene = make_scene(name)
     index = inner_fragments(scene, 32, "ground" if name == "ground" else None)
     assert len(index) == 32
@@ -244,7 +244,7 @@ def test_radiance_is_theirs(peer, name):
         ours = values[:, b]
         expected = np.hypot(deviation, SYSTEMATIC * ours)
         z = (mean - ours) / expected
-        # one figure for the three colours: they share their rays and so their noise
+        # one figure for the three colours, because they share their rays and so their noise
         signed = np.mean(mean - ours)
         spread = math.sqrt(np.sum(expected.mean(axis=-1) ** 2)) / len(index)
         assert abs(signed) < 4.0 * spread

@@ -137,7 +137,7 @@ def test_sources_and_tensors_say_the_same(seed):
 
 
 def test_the_shipped_library_may_rise_where_velvets_do():
-    own = default_embedding()._profiles
+    own = default_embedding().profiles_
     assert own.share.shape == own.grazing.shape
     assert np.all((own.share >= 0.0) & (own.share <= 1.701))
     assert own.share[: own.core, own.last >= own.core].max() <= 0.701

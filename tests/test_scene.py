@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from traitbrdf.scene.camera import MAX_SIDE, Camera
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight
-from traitbrdf.scene.scene import GROUND, Scene, _pattern
+from traitbrdf.scene.scene import GROUND, Scene, sample_pattern
 from traitbrdf.scene.shapes import Mesh, sphere
 from traitbrdf.scene.teapot import teapot
 
@@ -58,7 +58,7 @@ def sheets():
 
 
 def flat(made, shift=0.0, scale=1.0, drop=0):
-    """A mesh of trimesh, less its first faces, with the normals of its facets."""
+    """A trimesh mesh without its first faces, with the normals of its facets."""
     faces = np.asarray(made.faces)[drop:]
     normals = np.repeat(np.asarray(made.face_normals)[drop:, None], 3, axis=1)
     vertices = scale * (np.asarray(made.vertices) + shift)
@@ -158,7 +158,7 @@ def test_fragments_share_the_pixels_out(scene):
     np.testing.assert_allclose(covered + scene.uncovered, 1.0, rtol=0.0, atol=1e-6)
     assert np.all(scene.weights > 0.0)
     key = scene.pixel_part.astype(np.int64) * size + scene.pixels
-    assert np.all(np.diff(key) > 0)  # part by part, each pixel once
+    assert np.all(np.diff(key) > 0)  # sorted by part; each pixel occurs once
     count = np.diff(scene.offsets)
     assert scene.offsets[0] == 0
     assert scene.offsets[-1] == len(scene.normals)
@@ -167,7 +167,7 @@ def test_fragments_share_the_pixels_out(scene):
     )
     assert np.all(count[~scene.bordering] == 1)
     assert np.all(scene.weights[~scene.bordering] == 1.0)
-    # inside, a pixel is all that its centre is
+    # an inner pixel has the part and normal of its centre
     image, inside = scene.part_image.ravel(), ~scene.bordering
     np.testing.assert_array_equal(image[scene.pixels[inside]], scene.pixel_part[inside])
     assert not scene.uncovered[scene.pixels[inside]].any()
@@ -185,7 +185,7 @@ def test_samples_lie_in_their_pixels_and_face_the_viewer(scene):
     np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=-1), 1.0, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(scene.views, axis=-1), 1.0, atol=1e-9)
     assert np.all(np.sum(scene.normals * scene.views, axis=-1) > 0.0)
-    # back onto the image, by the camera's angles
+    # project back to the image, from the camera's angles
     camera = scene.camera
     a, e = np.radians([camera.azimuth, camera.elevation])
     back = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
@@ -280,11 +280,11 @@ def test_antialiasing_finds_the_area_better():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 16, 256])
 def test_an_edge_along_the_axes_comes_out_in_equal_steps(count):
-    x, y = _pattern(count)
+    x, y = sample_pattern(count)
     steps = (np.arange(count) + 0.5) / count
     np.testing.assert_allclose(np.sort(x), steps)
     np.testing.assert_allclose(np.sort(y), steps)
-    # spread: no two samples of 8 nearer than a fifth of a pixel
+    # well spread: no two of 8 samples are nearer than a fifth of a pixel
     if count == 8:
         apart = np.hypot(x[:, None] - x, y[:, None] - y) + np.eye(8)
         assert apart.min() > 0.2
@@ -448,7 +448,7 @@ def test_the_ground_lies_under_the_shape_and_changes_nothing_else(shape):
     assert bare.ground is False
     np.testing.assert_array_equal(np.where(scene.part_image == len(bare.parts), -1,
                                            scene.part_image), bare.part_image)  # fmt: skip
-    assert scene.coverage == pytest.approx(bare.coverage, abs=2e-3)  # a rim beside may add samples
+    assert scene.coverage == pytest.approx(bare.coverage, abs=2e-3)  # border pixels may add samples
     own = of_part(scene, GROUND)
     assert len(own) > 100
     assert np.all(scene.positions[own, 1] == shape.lowest)
@@ -471,7 +471,7 @@ def test_the_ground_is_not_seen_from_below(elevation, fov):
 
 
 def test_a_level_camera_sees_the_ground_edge_on():
-    # rays along the ground and next to: nothing is divided by zero
+    # rays along the ground and almost along it cause no division by zero
     scene = Scene(sphere(), SKY, camera=Camera(elevation=0.0), size=(31, 41), ground=1e3)
     assert len(of_part(scene, GROUND)) > 0
     assert np.isfinite(scene.positions).all()
@@ -490,7 +490,7 @@ def test_a_shape_with_a_ground_of_its_own_gets_no_other():
         Scene(made, SKY, size=4, ground=True)
 
 
-# -- what hides light -------------------------------------------------------------------------
+# -- shadows ----------------------------------------------------------------------------------
 
 UNDER = (0.3, -2.0, 0.5)
 
@@ -633,7 +633,7 @@ def test_convex_shapes_need_no_rays(shape):
     toward = np.array(light.direction)
     np.testing.assert_array_equal(irradiance.any(axis=-1), scene.normals @ toward > 0.0)
     assert scene.rays_cast == 0
-    # on the ground they do, and the ground's samples alone
+    # samples on the ground need rays, and only these
     scene = scene.changed(ground=True)
     assert scene.casts == (False, True)
     own = of_part(scene, GROUND)
@@ -665,7 +665,7 @@ def test_the_ground_hides_lights_beneath_it_and_nothing_of_the_map():
     above_disc = np.linalg.norm(scene.positions[index][:, [0, 2]], axis=1) <= 0.5
     np.testing.assert_array_equal(lit, faces_down & ~above_disc)
     assert min(np.count_nonzero(lit), np.count_nonzero(above_disc)) > 20
-    # a point light: by the way from the sample to it, if it is beneath at all
+    # a point light: along the segment to it, if it is below the ground
     for height, hides in ((-1.5, True), (-0.999, False)):
         light = PointLight((0.2, height, 0.1))
         toward, irradiance = scene.arriving(light, index)
@@ -682,7 +682,7 @@ def test_the_ground_hides_lights_beneath_it_and_nothing_of_the_map():
 
 @pytest.mark.parametrize("subdivisions", [1, 2, 3])
 def test_coarse_triangles_do_not_shadow_a_smooth_surface(subdivisions):
-    # the missing face is at the back: as open, the mesh is not known to be convex
+    # the missing face is at the back; an open mesh is not known to be convex
     shape = ball(subdivisions, drop=1)
     hole = ball(subdivisions).vertices[ball(subdivisions).faces[0]].mean(axis=0)
     azimuth, elevation = np.degrees([np.arctan2(-hole[0], -hole[2]), np.arcsin(-hole[1])])
@@ -700,7 +700,7 @@ def test_coarse_triangles_do_not_shadow_a_smooth_surface(subdivisions):
             shape.occluded(start, np.broadcast_to(np.array(light.direction), start.shape))
         )
         still += np.count_nonzero(~irradiance[grazing].any(axis=-1))
-    assert still < 0.05 * naive  # what the starts are for
+    assert still < 0.05 * naive  # this is the purpose of the starts
 
 
 def test_a_coarse_teapot_is_shadowed_like_a_fine_one():
@@ -717,13 +717,13 @@ def test_a_coarse_teapot_is_shadowed_like_a_fine_one():
 
 
 def test_light_reaches_what_the_camera_sees(small_teapot):
-    # from where the camera stands nothing hides what it sees, but for the offsets of the starts
+    # nothing hides visible points from the camera, except the offsets of the starts
     scene = small_teapot.changed(ground=True)
     free = scene.visible(everything(scene), unit(
         scene.camera.position(scene.shape, scene.height, scene.width) - scene.starts
     ))  # fmt: skip
     assert free.mean() > 0.99
-    # and from below the ground none of it comes through the shape
+    # and no light from below the ground passes through the shape
     own = of_part(scene, GROUND)
     dark = ~scene.visible(own, np.broadcast_to([0.0, 1.0, 0.0], (len(own), 3)))
     under = np.hypot(*scene.positions[own][:, [0, 2]].T) < 1.0
@@ -745,7 +745,7 @@ def test_rays_are_cast_in_chunks(monkeypatch, small_teapot):
 
     whole = answers()
     rng = np.random.default_rng(0)
-    monkeypatch.setattr("traitbrdf.scene.scene._CHUNK", 37)
+    monkeypatch.setattr("traitbrdf.scene.scene.RAYS_AT_ONCE", 37)
     for a, b in zip(whole, answers(), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -880,13 +880,13 @@ def test_scenes_of_odd_meshes(name):
         _, irradiance = scene.arriving(light, index)
         assert np.isfinite(irradiance).all()
         assert 0.1 < irradiance.any(axis=-1).mean() < 1.0
-    # light from the camera reaches all that is seen, whatever winding and normals say
+    # light from the camera reaches every visible point, whatever the winding and normals
     forced = scene.changed()
     forced.casts = (True,) * len(scene.parts)
     eye = scene.camera.position(shape, 40, 40)
     assert forced.visible(index, unit(eye - scene.starts)).mean() > 0.98
     own = of_part(scene, "body")
-    assert not forced.visible(own, -scene.normals[own]).any()  # its own triangle is before it
+    assert not forced.visible(own, -scene.normals[own]).any()  # its own triangle hides it
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -914,7 +914,7 @@ def test_half_a_million_triangles_take_seconds():
     shape = Mesh(vertices, faces, vertices, np.zeros(len(faces), int), ("ball",))
     scene = Scene(shape, SKY, size=64, ground=True)
     free = scene.visible(everything(scene), unit(scene.normals + 0.5 * spiral(1)))
-    assert time.perf_counter() - start < 30.0  # some 2 s where nothing else runs
+    assert time.perf_counter() - start < 30.0  # some 2 s on an idle machine
     assert free[of_part(scene, "ball")].all()
     assert scene.coverage == pytest.approx(Scene(sphere(), SKY, size=64).coverage, abs=1e-3)
 
@@ -999,7 +999,7 @@ def test_lights_are_kept():
 
 
 class Counted:
-    """A shape that counts the rays it is asked about."""
+    """A shape that counts its rays."""
 
     def __init__(self, shape):
         self._shape, self.rays = shape, 0

@@ -64,7 +64,7 @@ def view(
 
 
 def check_hits(hits: Hits, directions: NDArray[np.float64]) -> None:
-    """What holds for the hits of every shape."""
+    """Check what holds for the hits of every shape."""
     assert hits.part.dtype == np.int32
     assert hits.position.dtype == hits.normal.dtype == hits.start.dtype == np.float64
     hit = hits.part >= 0
@@ -96,7 +96,7 @@ def test_sphere_is_hit_where_the_closed_form_says(
     origin = c + scale * (local + np.array([0.0, 0.0, far]))
     hits = ball.intersect(origin, np.array([[0.0, 0.0, -1.0]]))
     assert hits.part[0] == 0
-    # the origin itself is only known to one rounding, and a graze magnifies it
+    # the origin has one rounding error, which a grazing hit magnifies
     tolerance = 4e-16 * (far + 2.0) / local[2]
     assert np.allclose(hits.normal[0], local, rtol=0.0, atol=tolerance + 1e-14)
     assert np.allclose(hits.position[0], c + scale * local, rtol=0.0, atol=2.0 * scale * tolerance)
@@ -307,7 +307,7 @@ def test_no_ray_slips_through_the_teapot(azimuth: float, elevation: float) -> No
 def _misses_are_on_the_silhouette(
     mesh: Mesh, points: NDArray[np.float64], d: NDArray[np.float64]
 ) -> bool:
-    """Whether each missed point has free space beside it, as a silhouette has and a crack not."""
+    """Whether each missed point is next to free space, as at a silhouette but not at a crack."""
     missed = mesh.intersect(points - 9.0 * d, d).part < 0
     nudges = 1e-3 * np.stack(np.broadcast_arrays(*np.eye(3)))
     beside = np.zeros(missed.sum(), dtype=bool)
@@ -331,7 +331,7 @@ def test_mesh_works_at_any_size_and_distance(scale: float) -> None:
     for away in (0.0, 1e6):
         hits = other.intersect(scale * (o + 5.0 - away * d), d)
         same = hits.part == expected.part
-        assert same.mean() > 0.995  # a ray along an edge may fall to either side
+        assert same.mean() > 0.995  # a ray along an edge may hit either side
         assert np.allclose(
             hits.position[same & (hits.part >= 0)] / scale - 5.0,
             expected.position[same & (hits.part >= 0)],
@@ -384,7 +384,7 @@ def test_shading_normals_are_bent_towards_the_viewer() -> None:
 
 
 def test_winding_may_disagree_with_the_normals() -> None:
-    # the normals say which side is out, so both windings look the same
+    # the normals decide which side is outside, so the winding does not matter
     pot = teapot(8)
     turned = Mesh(pot.vertices, pot.faces[:, ::-1], pot.normals, pot.face_part, pot.parts)
     o, d = view(pot, 35.0, 20.0, 24)
@@ -415,13 +415,13 @@ def bulging_triangle(*bend: float) -> Mesh:
 
 @pytest.mark.parametrize(("bend", "side"), [(0.3, 1.0), (-0.3, -1.0)])
 def test_a_bulging_triangle_lifts_the_start_by_hand(bend: float, side: float) -> None:
-    # at the centroid each tangent plane is |bend| off along its normal; what is across cancels
+    # at the centroid each tangent plane is |bend| away; components across the normal cancel
     tri = bulging_triangle(bend, bend, bend)
     origin, down = np.array([0.0, 0.0, side * 5.0]), np.array([[0.0, 0.0, -side]])
     hits = tri.intersect(origin, down)
     lift = abs(bend) * np.sqrt(1.0 - bend**2)
     assert np.allclose(hits.start[0], [0.0, 0.0, side * (lift + 1e-4 * tri.radius)], atol=1e-7)
-    # from the other side it is hollow, and nothing is lifted
+    # from the other side the surface is concave, and nothing is lifted
     hollow = tri.intersect(-origin, -down)
     assert np.allclose(hollow.start[0], [0.0, 0.0, -side * 1e-4 * tri.radius], atol=1e-7)
 
@@ -436,7 +436,7 @@ def test_only_the_corners_that_bulge_lift_the_start() -> None:
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(SCALES))
 def test_shadow_rays_start_on_the_side_that_is_seen(seed: int, scale: float) -> None:
-    # whatever the normals say: at least the offset above the triangle
+    # for any normals the start is at least the offset above the triangle
     rng = np.random.default_rng(seed)
     corner = scale * rng.normal(size=(3, 3))
     tri = Mesh(corner, [[0, 1, 2]], rng.normal(size=(3, 3)), [0], ("t",))
@@ -497,7 +497,7 @@ def test_convex_hulls_are_convex_and_dented_ones_not(seed: int, count: int, scal
     # float32, as files store it
     assert plain(vertices.astype(np.float32), faces).convex
     assert not plain(vertices, faces[1:]).convex  # open
-    # a corner pushed a twentieth of its way to the middle leaves a dent, unless it stays outmost
+    # a corner moved inwards by a twentieth leaves a dent, unless it stays outermost
     inward = hull.vertices.copy()
     at = faces[0, 0]
     inward[at] += 0.05 * (inward.mean(axis=0) - inward[at])
@@ -566,7 +566,7 @@ def test_a_finely_cut_box_is_convex_in_float32() -> None:
 
 
 def test_small_dents_that_add_up_are_found() -> None:
-    # a fine grid, each of whose edges bends inwards by less than what counts as bent
+    # a fine grid whose edges each bend inwards by less than the tolerance
     n = 200
     grid = np.linspace(-1.0, 1.0, n + 1)
     x, z = (a.ravel() for a in np.meshgrid(grid, grid))
@@ -752,7 +752,7 @@ def test_obj_groups_without_faces_are_no_parts(tmp_path: Path) -> None:
     path = tmp_path / "empty.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\ng none\ng some\nf 1 2 3\ng last\n")
     assert load_mesh(path).parts == ("some",)
-    # a group that comes twice is one part
+    # a group that occurs twice is one part
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\ng a\nf 1 2 3\ng b\nf 1 3 2\ng a\nf 2 3 1\n")
     made = load_mesh(path)
     assert made.parts == ("a", "b")

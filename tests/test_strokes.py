@@ -179,7 +179,7 @@ def test_region_weights_are_shares_of_the_covered_object():
 
 
 def bent(seed):
-    """A random band: what a bent spout or handle looks like."""
+    """A random band, shaped like a bent spout or handle."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:60, :80]
     centre = rng.uniform((20.0, 20.0), (60.0, 40.0))

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from sessions import over
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 from websockets.exceptions import ConnectionClosed
@@ -27,32 +28,20 @@ import traitbrdf as tb
 from traitbrdf.cli import main
 from traitbrdf.design.strokes import Stroke, follow
 from traitbrdf.formats.display import Display, exposure_of, tone_map
-from traitbrdf.session import editing, preparation
+from traitbrdf.session import preparation, viewer
 from traitbrdf.session.editing import EditSession
-from traitbrdf.session.preparation import Prepared
 from traitbrdf.studio import studio
 from traitbrdf.studio.page import Server, application, pack, unpack
 from traitbrdf.studio.session import LARGEST, Session
-from traitbrdf.transport.transport import Transport
 
 BRUSH = {"trait": "shiny", "amount": -0.6, "radius": 2.0, "stay": True}
-
-
-@pytest.fixture(scope="module")
-def prepared(small_teapot, training):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparation, "training_of", lambda library, seed: training)
-        return EditSession(small_teapot, quality="preview", cache=False).prepare()
 
 
 @pytest.fixture
 def session(prepared, training, tmp_path, monkeypatch):
     """Over a prepared teapot, of one material."""
     monkeypatch.setattr(preparation, "training_of", lambda library, seed: training)
-    edit = EditSession(prepared.scene, quality="preview", cache=False)
-    again = Transport.restored(prepared.scene, prepared.grid, prepared.arrays())
-    edit._view.prepared = Prepared(again, False, {}, again)
-    session = Session(edit, tmp_path)
+    session = Session(over(prepared, cache=False), tmp_path)
     yield session
     session.close()
 
@@ -177,7 +166,7 @@ def test_a_stroke_in_pieces_is_the_whole_stroke(session):
     edit = eval(line.replace("edit.paint(", "dict(stroke=", 1), {"tb": tb, "dict": dict})
     assert edit["stroke"].amount == pytest.approx(amount)
     assert edit["only"] == "handle"
-    session.edit.paint(edit["stroke"], edit["only"])
+    session.edit.paint(edit["stroke"], only=edit["only"])
     np.testing.assert_allclose(session.edit.material("handle").z, kept)
 
 
@@ -298,11 +287,11 @@ def test_orbit_zoom_and_turn(session):
     state = frame(replies)["state"]
     assert not state["ready"]
     assert state["error"] > 0.0
-    assert session.edit._view.draft[0] == 64  # a hand that turns the object sees it turn
+    assert session.edit.view.draft[0] == 64  # a hand that turns the object sees it turn
     ask(session, turn=90.0, dragging=True)
     now = session.edit.scene.environment.rotation
     assert (now - turned) % (2.0 * np.pi) == pytest.approx(0.5 * np.pi)
-    assert session._refiner is None  # nothing is prepared while the hand drags
+    assert session.refiner is None  # nothing is prepared while the hand drags
 
 
 def test_views_are_prepared_once_the_hand_rests(session):
@@ -331,9 +320,9 @@ def test_a_preparation_that_fails_is_told(session, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("no rays today")
 
-    monkeypatch.setattr(editing, "prepare_view", fail)
+    monkeypatch.setattr(viewer, "prepare_view", fail)
     ask(session, orbit=[15.0, 0.0])
-    session._refiner.join(60.0)
+    session.refiner.join(60.0)
     assert "no rays today" in frame(ask(session, dragging=True))["state"]["trouble"]
 
 
@@ -432,7 +421,7 @@ def test_a_view_that_is_gone_is_no_trouble(session):
 
 
 def test_an_edit_that_raises_is_told_and_the_session_goes_on(session, monkeypatch):
-    def fail(*arguments):
+    def fail(*arguments, **more):
         raise RuntimeError("out of paint")
 
     with monkeypatch.context() as patch:
@@ -590,7 +579,7 @@ def test_the_socket_asks_for_token_and_origin(client, session, token, origin):
     ):
         pass
     assert closed.value.code == 4403
-    assert not session._pushes
+    assert not session.subscribers
 
 
 def test_messages_over_the_socket(client, session):
@@ -608,11 +597,11 @@ def test_messages_over_the_socket(client, session):
             assert unpack(socket.receive_bytes())[0]["kind"] == "error"
         socket.send_text("hello")
         assert unpack(socket.receive_bytes())[0]["kind"] == "error"
-        assert len(session._pushes) == 1
+        assert len(session.subscribers) == 1
     deadline = time.monotonic() + 10.0
-    while session._pushes and time.monotonic() < deadline:  # a closed tab is forgotten
+    while session.subscribers and time.monotonic() < deadline:  # a closed tab is forgotten
         time.sleep(0.02)
-    assert not session._pushes
+    assert not session.subscribers
     assert len(session.edit.history) == 1
 
 
@@ -665,7 +654,7 @@ def test_a_port_in_use_is_refused(session, server):
 
 def test_servers_listen_on_this_machine_alone(server):
     assert server.url.startswith("http://127.0.0.1:")
-    assert server._socket.getsockname()[0] == "127.0.0.1"
+    assert server.listener.getsockname()[0] == "127.0.0.1"
     assert len(server.token) >= 32
 
 
@@ -700,7 +689,7 @@ def test_pages_of_this_machine_are_offered_a_socket(session, monkeypatch):
     for origin in ("https://hub.example", "http://127.0.0.1.example:8888", "", 3, "x" * 101, None):
         widget._handle_custom_msg({"kind": "hello", "view": "a", "origin": origin}, [])
         assert (sent[-1]["kind"], sent[-1]["socket"]) == ("frame", None)
-    assert widget._server is None
+    assert widget.server is None
     home = "http://localhost:8888"
     widget._handle_custom_msg({"kind": "hello", "view": "a", "origin": home}, [])
     address = sent[-1]["socket"]

@@ -11,13 +11,13 @@ from PIL import Image
 
 from traitbrdf.bench import trade
 from traitbrdf.bench.datasets import default_data
-from traitbrdf.bench.trade import _Point, coarser, knee, knot, pareto, vase
+from traitbrdf.bench.trade import TradePoint, coarser, knee, knot, pareto, vase
 from traitbrdf.cli import main
 from traitbrdf.scene.lights import EnvironmentMap
 
 
 def point(milliseconds, error, megabytes=1.0):
-    return _Point(8, "float32", 1.0, milliseconds, megabytes, error, 2.0 * error, 1.0)
+    return TradePoint(8, "float32", 1.0, milliseconds, megabytes, error, 2.0 * error, 1.0)
 
 
 def test_a_front_is_what_nothing_beats():
@@ -30,7 +30,7 @@ def test_a_front_is_what_nothing_beats():
     ]
     front = pareto(points)
     assert [p.milliseconds for p in front] == [1.0, 2.0, 4.0]
-    # less memory is worth something too, and equals do not beat each other
+    # less memory counts too, and equal points do not beat each other
     assert len(pareto([*points, point(3.0, 0.03, 0.5)])) == 4
     assert len(pareto([points[0], points[0]])) == 2
 
@@ -39,7 +39,7 @@ def test_a_knee_is_where_time_stops_paying():
     front = [point(1.0, 0.1), point(1.5, 0.02), point(2.0, 0.004), point(8.0, 0.0035)]
     assert knee(front).milliseconds == 2.0
     assert knee(front[:1]) is front[0]
-    assert knee([*front, point(1.2, 0.5)]).milliseconds == 2.0  # what is slower and worse is no end
+    assert knee([*front, point(1.2, 0.5)]).milliseconds == 2.0  # a dominated point does not matter
 
 
 def test_coarser_maps_hold_the_same_light():
@@ -57,7 +57,7 @@ def test_coarser_maps_hold_the_same_light():
 
 @pytest.mark.parametrize("make", [knot, vase])
 def test_shapes_have_outward_normals(make):
-    """The faces wind as their normals say, so that both sides are told apart."""
+    """The winding of the faces agrees with their normals."""
     mesh = make(60, 20)
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -100,7 +100,7 @@ def test_the_trade_is_printed_written_and_drawn(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_promises_are_held_against_the_oracle(capsys):
-    """Small and few: the full figures are the bench's."""
+    """A small run; the bench measures the full figures."""
     said = []
     records = list(trade.promises_kept(default_data(), True, said.append))
     shares = {r.name: r.value for r in records if "meet it" in r.name}

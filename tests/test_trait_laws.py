@@ -38,8 +38,9 @@ from traitbrdf.bench.traits import (
 )
 from traitbrdf.reflectance.descriptors import read
 from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.holding import COLOURS, LIGHT
 from traitbrdf.space.library import default_library
-from traitbrdf.space.traits import COLOURS, LIGHT, default_traits
+from traitbrdf.space.traits import default_traits
 
 SPACE = default_traits()
 PLAIN = [name for name in SPACE.names if name not in COLOURS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ from hypothesis import strategies as st
 from traitbrdf.bench.people import RATINGS, rated_materials, spearman
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.reflectance.descriptors import DESCRIPTORS, cielab, descriptors, hue
+from traitbrdf.space.definitions import Definition, Labelled, Statistics
 from traitbrdf.space.embedding import GRID
+from traitbrdf.space.holding import COLOURS, KEEPS_BODY, LIGHT
 from traitbrdf.space.learning import Trait, suggest
 from traitbrdf.space.library import default_embedding, default_library
-from traitbrdf.space.traits import COLOURS, KEEPS_BODY, LIGHT, TraitSpace, default_traits
+from traitbrdf.space.scores import Box
+from traitbrdf.space.traits import TraitSpace, default_traits
 
 EMBEDDING = default_embedding()
 LIBRARY = default_library()
@@ -185,7 +189,7 @@ def test_a_drag_is_smooth_between_the_steps_of_a_move(z, name, hold, up):
     amounts = np.linspace(0.0, 0.3, 46) * (1.0 if up else -1.0)
     moves = [SPACE.reach(z, {name: a}, hold) for a in amounts]
     way = np.array([m.z for m in moves])
-    shown = np.array([SPACE._ground.seen(point) for point in way])
+    shown = np.array([SPACE.colours(point) for point in way])
     assert np.linalg.norm(np.diff(shown, axis=0), axis=-1).max() < 20.0 * (0.3 / 45) / 0.05
     for amount, m in zip(amounts, moves, strict=True):
         if m.complete:
@@ -304,15 +308,23 @@ def test_bad_moves(asked, hold, error, match):
         SPACE.move(INNER[0], asked, hold)
 
 
+def straight_space(names, normals, box):
+    """Traits that are linear functions of the coordinates."""
+    typical = np.array([0.0, 1.0])
+    traits = [
+        Definition(n, np.zeros(0), np.array(v), typical)
+        for n, v in zip(names, normals, strict=True)
+    ]
+    return TraitSpace(traits, box, Statistics(np.eye(len(box.low))))
+
+
 @pytest.mark.parametrize(
     ("asked", "hold"), [({"a": 0.5}, ("c",)), ({"a": 0.5, "c": 0.5}, ()), ({"a": 1.0}, ("d", "b"))]
 )
 def test_holds_that_forbid_the_move(asked, hold):
     """c is the contrary of a, and d is a + b: neither can stay alone."""
     normals = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
-    space = TraitSpace(
-        "abcd", normals, [[0.0, 1.0]] * 4, np.eye(3), np.full(3, -2.0), np.full(3, 2.0)
-    )
+    space = straight_space("abcd", normals, Box(np.full(3, -2.0), np.full(3, 2.0)))
     with pytest.raises(ValueError, match="depend on each other"):
         space.move(np.zeros(3), asked, hold)
     np.testing.assert_allclose(space.move(np.zeros(3), {"a": 0.5, "c": -0.5}), [0.5, 0.0, 0.0])
@@ -330,7 +342,8 @@ def test_bad_points(z):
 def fit(labels, z=None, families=None):
     if z is None:
         z = np.random.default_rng(0).normal(size=(20, 3))
-    return TraitSpace.fit(z, labels, np.full(3, -5.0), np.full(3, 5.0), families)
+    traits = [Labelled(name, given) for name, given in labels.items()]
+    return TraitSpace.fit(z, traits, Box(np.full(3, -5.0), np.full(3, 5.0)), families)
 
 
 def test_a_fit_finds_the_axis_that_separates():
@@ -381,12 +394,26 @@ def test_bad_families_and_shapes():
     with pytest.raises(ValueError, match="families"):
         fit({"x": label}, families=["a"])
     good = fit({"x": label})
-    with pytest.raises(ValueError, match="covariance"):
-        TraitSpace(["x"], good.normals, good.typical, np.eye(4), good.low, good.high)
-    with pytest.raises(ValueError, match="normals"):
-        TraitSpace(["x", "y"], good.normals, good.typical, good.covariance, good.low, good.high)
+    (trait,), known = good.traits, Statistics(good.covariance)
+
+    def same(statistics=known, box=good.box, body=None, **changes):
+        return TraitSpace([replace(trait, **changes)], box, statistics, body=body)
+
+    assert same().names == ("x",)
+    for name, wrong in (("covariance", 4), ("related", 2), ("limits", 2)):
+        with pytest.raises(ValueError, match=f"^{name}: expected shape"):
+            same(replace(known, **{name: np.eye(wrong)}))
+    for name, size in (("normal", 3), ("typical", 2), ("weights", 0)):
+        with pytest.raises(ValueError, match=f"^{name} of 'x': expected shape .{size},."):
+            same(**{name: np.zeros(5)})
+    with pytest.raises(ValueError, match="high"):
+        same(box=Box(good.low, good.high[:2]))
+    with pytest.raises(ValueError, match="body"):
+        same(body=np.eye(2))
     with pytest.raises(ValueError, match="percentile"):
-        TraitSpace(["x"], good.normals, [[1.0, 1.0]], good.covariance, good.low, good.high)
+        same(typical=np.ones(2))
+    with pytest.raises(ValueError, match=r"'x'.*more than once"):
+        same(synonyms=("x",))
 
 
 def test_a_table_decides_its_scores():
@@ -553,6 +580,22 @@ def test_a_trait_is_learnt_from_a_handful_of_labels():
     assert replaced.score(z)["tinny"] == pytest.approx(1.0 - space.score(z)["tinny"], abs=1e-6)
 
 
+def test_a_trait_of_one_s_own_leaves_moves_of_others_as_they_are():
+    mine = Trait.from_labels("candy", ["blue-plastic", "red-rubber"], [1, -1])
+    other = Trait.from_labels("bleak", ["chrome", "red-rubber"], [-1, 1])
+    space = SPACE.with_trait(mine).with_trait(other)
+    again = TraitSpace.from_arrays({**space.arrays(), "low": LOW, "high": HIGH})
+    rng = np.random.default_rng(5)
+    for name in SPACE.names:
+        z = LIBRARY.coordinates[rng.integers(len(LIBRARY))]
+        amount = rng.uniform(-0.5, 0.5)
+        expected = SPACE.move(z, {name: amount})
+        np.testing.assert_array_equal(space.move(z, {name: amount}), expected)
+        np.testing.assert_array_equal(again.move(z, {name: amount}), expected)
+    with pytest.raises(ValueError, match="unknown trait"):
+        SPACE.move(z, {"candy": 0.1})
+
+
 def test_a_trait_is_learnt_from_ratings_of_tables_and_coordinates():
     some = LIBRARY.coordinates[::400]
     ratings = SPACE.scores(some)[:, SPACE.index("bright")]
@@ -608,7 +651,7 @@ def test_everyday_names_cannot_be_taken():
 
 
 def test_straight_traits_alone_learn_nothing():
-    space = TraitSpace("a", np.eye(24)[:1], [[0.0, 1.0]], np.eye(24), LOW, HIGH)
+    space = straight_space("a", np.eye(24)[:1], SPACE.box)
     with pytest.raises(ValueError, match="reads descriptors"):
         Trait.from_labels("x", ["chrome", "red-rubber"], [1, -1], space)
 

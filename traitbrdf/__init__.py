@@ -1,12 +1,14 @@
-"""traitbrdf: paint traits, not parameters.
+"""Paint material traits on objects and see the result under real light at once.
 
-Materials of a shape's parts are edited by painting or moving traits ("shiny", "metallic") and
-rendered at once under real light; what comes out is a real, tabulated BRDF.
+Edit the materials of a shape's parts by painting or moving traits ("shiny", "metallic"). Each
+result is a tabulated BRDF that can be written to a file.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from traitbrdf import reference as reference
+from traitbrdf.design import effects as effects
+from traitbrdf.design.effects import *  # noqa: F403  (a new effect is public at once)
 from traitbrdf.design.strokes import Stroke as Stroke
 from traitbrdf.formats.files import FormatError as FormatError
 from traitbrdf.reflectance import models as models
@@ -61,11 +63,11 @@ __all__ = [
     "studio",
     "teapot",
 ]
+__all__ += effects.__all__
 
 
 def __getattr__(name: str) -> Any:
-    """Sessions are loaded when first asked for: torch and the compiled loops take a second, which
-    materials and traits need not wait for."""
+    """Import sessions on first use: torch and the compiled loops take a second to load."""
     if name == "EditSession":
         from traitbrdf.session.editing import EditSession
 

@@ -1,6 +1,6 @@
 """The command line: ``traitbrdf demo | paint | render | angles | gallery | studio | info | bench``.
 
-Exit status: 0 done, 1 failed with one readable line, 2 wrong usage.
+The exit status is 0 on success, 1 on failure with one readable line, 2 on wrong usage.
 """
 
 from __future__ import annotations
@@ -38,7 +38,13 @@ DEMO_AMOUNT = 0.8
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit status."""
+    """Run the command line and return the exit status.
+
+    Parameters
+    ----------
+    arguments : sequence of str or None
+        None is `sys.argv`.
+    """
     parser = _parser()
     given = parser.parse_args(arguments)
     try:
@@ -67,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--material", default=DEMO_MATERIAL, help="library name (%(default)s)")
     demo.set_defaults(run=_demo)
 
-    paint = commands.add_parser("paint", help="one trait edit of one part, to a picture")
+    paint = commands.add_parser("paint", help="edit traits of one part and write a picture")
     _add_scene(paint)
     paint.add_argument("--part", help="part to edit (default: the handle, or the only part)")
     paint.add_argument(
@@ -80,86 +86,86 @@ def _parser() -> argparse.ArgumentParser:
     paint.add_argument("--save", type=Path, help="also write the design (.tbr)")
     paint.set_defaults(run=_paint)
 
-    render = commands.add_parser("render", help="a material, or a saved design, to a picture")
+    render = commands.add_parser("render", help="render a material or a saved design")
     _add_scene(render)
     render.add_argument(
         "--material", default=DEMO_MATERIAL,
         help="library name, or a MERL .binary or RGL .bsdf file (%(default)s)",
     )  # fmt: skip
     render.add_argument("--design", type=Path, help="a design saved as .tbr; replaces the scene")
-    render.add_argument("--reference", action="store_true", help="by the oracle: slow, exact")
+    render.add_argument(
+        "--reference", action="store_true", help="use the reference integrator: slow, exact"
+    )
     render.add_argument("--out", type=Path, required=True, help="picture (.png) or radiance (.exr)")
     render.set_defaults(run=_render)
 
-    angles = commands.add_parser("angles", help="which angles of a BRDF a scene shows at all")
+    angles = commands.add_parser("angles", help="map of the BRDF angles that a scene shows")
     _add_scene(angles)
-    angles.add_argument("--part", help="of this part alone (default: of the shape)")
+    angles.add_argument("--part", help="only this part (default: the whole shape)")
     angles.add_argument("--out", type=Path, required=True, help="picture (.png)")
     angles.set_defaults(run=_angles)
 
-    studio = commands.add_parser("studio", help="paint live in a page on this machine")
+    studio = commands.add_parser("studio", help="paint live in a page served by this machine")
     _add_scene(studio)
     studio.add_argument("--mesh", type=Path, help="mesh file (.obj, .ply, .glb, ...) to paint on")
     studio.add_argument("--material", default="blue-plastic", help="library name (%(default)s)")
     studio.add_argument("--design", type=Path, help="a design saved as .tbr; replaces the scene")
-    studio.add_argument(
-        "--port", type=int, default=0, help="0 takes any that is free (%(default)s)"
-    )
+    studio.add_argument("--port", type=int, default=0, help="0 takes any free port (%(default)s)")
     studio.add_argument("--no-browser", action="store_true", help="only print the address")
     studio.set_defaults(run=_studio, ground=2.0)
 
-    gallery = commands.add_parser("gallery", help="spheres of materials, moved along their traits")
+    gallery = commands.add_parser("gallery", help="spheres of materials, moved along traits")
     gallery.add_argument(
         "--trait", action="append", default=[], metavar="NAME",
-        help="move these from -1 to 1; may be repeated; 'all' is every trait",
+        help="trait to move from -1 to 1; may be repeated; 'all' is every trait",
     )  # fmt: skip
     gallery.add_argument(
         "--material", action="append", default=[], metavar="NAME",
-        help=f"library names (default: {', '.join(GALLERY)})",
+        help=f"library name; may be repeated (default: {', '.join(GALLERY)})",
     )  # fmt: skip
     _add_hold(gallery)
     gallery.add_argument(
         "--method", choices=("flow", "linear"), default="flow",
-        help="linear: the straight vectors of Matusik et al. 2003 (%(default)s)",
+        help="linear: the linear trait vectors of Matusik et al. 2003 (%(default)s)",
     )  # fmt: skip
     gallery.add_argument(
         "--amount", action="append", type=float, metavar="AMOUNT",
         help="amounts to move by; may be repeated (default: seven from -1 to 1)",
     )  # fmt: skip
     gallery.add_argument(
-        "--table", action="store_true", help="one row a trait, the materials side by side"
+        "--table", action="store_true", help="one row per trait, the materials side by side"
     )
     gallery.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a sky")
-    gallery.add_argument("--size", type=_size, default=96, help="pixels a sphere (%(default)s)")
+    gallery.add_argument("--size", type=_size, default=96, help="pixels per sphere (%(default)s)")
     gallery.add_argument("--out", type=Path, required=True, help="picture (.png)")
     gallery.set_defaults(run=_gallery)
 
-    info = commands.add_parser("info", help="what the package ships, or what a file holds")
+    info = commands.add_parser("info", help="list what the package ships, or what a file holds")
     info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
     info.set_defaults(run=_info)
 
-    timing = commands.add_parser("bench", help="errors and times, measured in one run")
+    timing = commands.add_parser("bench", help="measure errors and times")
     timing.add_argument(
         "names", nargs="*", metavar="NAME",
-        help=f"of {', '.join(NAMES)} "
+        help=f"one or more of {', '.join(NAMES)} "
         f"(default: all but {', '.join(sorted(ON_REQUEST))})",
     )  # fmt: skip
     timing.add_argument(
         "--peers", action="store_true",
-        help="beside Mitsuba 3, at equal error: the same as to name 'peers' (some 10 minutes; "
-        "needs traitbrdf[peers])",
+        help="compare with Mitsuba 3 at equal error; the same as the name 'peers' (some 10 "
+        "minutes; needs traitbrdf[peers])",
     )  # fmt: skip
     timing.add_argument(
         "--trade", action="store_true",
-        help="every knob of speed against accuracy, alone and together: the same as to name "
+        help="vary every knob of speed and accuracy, alone and together; the same as the name "
         "'trade' (some 10 minutes)",
     )  # fmt: skip
     timing.add_argument(
         "--out", type=Path, metavar="FOLDER",
-        help="where the trade's trade.json and trade.png go (the plot needs traitbrdf[plots])",
+        help="folder for trade.json and trade.png (the plot needs traitbrdf[plots])",
     )  # fmt: skip
-    timing.add_argument("--quick", action="store_true", help="small sizes, some two minutes")
-    timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records")
+    timing.add_argument("--quick", action="store_true", help="small sizes (some two minutes)")
+    timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records here")
     timing.add_argument(
         "--data", type=Path, help="folder with envmaps/ and rgl/ ($TRAITBRDF_SHARED)"
     )
@@ -172,7 +178,8 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shape", choices=("teapot", "sphere"), default="teapot")
     parser.add_argument(
         "--ground", type=float, nargs="?", const=2.0, default=0.0, metavar="RADIUS",
-        help="let it stand on a disc, by default of 2 radii of the shape; 0 for none (%(default)s)",
+        help="radius of a ground disc, in radii of the shape; 2 if none is given; 0 is no ground "
+        "(%(default)s)",
     )  # fmt: skip
     parser.add_argument("--size", type=_size, default=512, help="pixels (%(default)s)")
     parser.add_argument(
@@ -218,7 +225,7 @@ def _scene(given: argparse.Namespace, mesh: Shape | None = None) -> tb.Scene:
 
 
 def _write(path: Path, image: NDArray[np.float32]) -> None:
-    """Write an image to a path that `_check_out` let pass."""
+    """Write an image to a path that `_check_out` has accepted."""
     if path.suffix.lower() == ".exr":
         write_exr(path, image)
     else:
@@ -226,14 +233,14 @@ def _write(path: Path, image: NDArray[np.float32]) -> None:
 
 
 def _check_out(path: Path) -> None:
-    """Refuse an output that cannot be written before any work is done."""
+    """Refuse an output that cannot be written, before any work is done."""
     if path.suffix.lower() not in (".png", ".exr"):
         raise ValueError(f"--out: expected a name that ends in .png or .exr, got {str(path)!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
 
 
 class _Progress:
-    """A line on standard error that says what is being done, on a terminal only."""
+    """A line of progress on standard error, if that is a terminal."""
 
     def __init__(self) -> None:
         self.shown = sys.stderr.isatty()
@@ -293,7 +300,7 @@ def _demo(given: argparse.Namespace) -> int:
     clock = step("stroke", clock)
     after = session.render()
     step("frame after the stroke", clock)
-    # a border pixel belongs to all parts that it shows
+    # a border pixel belongs to every part that it shows
     outside = np.ones(inside.shape, bool)
     outside.flat[scene.pixels[scene.part_slice(scene.parts.index(part))]] = False
     changed = int(np.count_nonzero((before != after).any(axis=-1) & outside))
@@ -301,7 +308,7 @@ def _demo(given: argparse.Namespace) -> int:
         f"painted 'shiny' {DEMO_AMOUNT:+g} on "
         + ", ".join(f"the {name} ({amount:+.3f})" for name, amount in moved.items())
         + f" ({1e3 * seconds['stroke']:.2f} ms); its score rose by {risen:.3f}, "
-        f"{100 * risen / DEMO_AMOUNT:.0f} % of what was asked"
+        f"{100 * risen / DEMO_AMOUNT:.0f} % of what was asked for"
     )
     print(
         f"frame after the stroke: {1e3 * seconds['frame after the stroke']:.2f} ms; pixels "
@@ -310,7 +317,7 @@ def _demo(given: argparse.Namespace) -> int:
     report = session.report()
     print(
         f"frame error, measured on probe pixels (mean relative L1): "
-        f"{100 * report['frame_error']:.3f} % of all that is shown, "
+        f"{100 * report['frame_error']:.3f} % of the whole frame, "
         f"{100 * report['parts'][part]['error']:.3f} % of the {part}"
     )
     exposure = exposure_of(before)
@@ -334,7 +341,7 @@ def _demo(given: argparse.Namespace) -> int:
 
 
 def _draw_stroke(picture: NDArray[np.uint8], stroke: tb.Stroke) -> NDArray[np.uint8]:
-    """The picture with the stroke's brush laid over it in yellow."""
+    """Return the picture with the stroke's brush laid over it in yellow."""
     cover = stroke.coverage(*picture.shape[:2])[..., None]
     yellow = np.array([255.0, 214.0, 10.0])
     alpha = np.where(cover > 0.0, 0.35 + 0.45 * cover, 0.0)
@@ -345,8 +352,8 @@ def _draw_stroke(picture: NDArray[np.uint8], stroke: tb.Stroke) -> NDArray[np.ui
 def _add_hold(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--hold", action="append", metavar="NAME",
-        help="what shall stay: a trait, colour, lightness or body; may be repeated; 'nothing' lets "
-        "go (default: colour and lightness, unless a trait is about them)",
+        help="what to hold constant: a trait, colour, lightness or body; may be repeated; "
+        "'nothing' holds nothing (default: colour and lightness, unless a trait is about them)",
     )  # fmt: skip
 
 
@@ -389,7 +396,7 @@ def _render(given: argparse.Namespace) -> int:
         image = tb.reference.render(session.scene, brdfs, progress=progress)
         progress.done()
         _write(given.out, image.astype(np.float32))
-        error = "error below 0.01 % by its own estimate"
+        error = "estimated error below 0.01 %"
     else:
         _write(given.out, session.render())
         error = f"frame error {100 * session.report()['frame_error']:.3f} %"
@@ -408,7 +415,7 @@ def _material(name: str) -> str | Reflectance:
 
 
 def _angles(given: argparse.Namespace) -> int:
-    # torch comes with it
+    # imports torch, which most commands do not need
     from traitbrdf.pictures import angle_map
 
     given.out.parent.mkdir(parents=True, exist_ok=True)
@@ -419,7 +426,7 @@ def _angles(given: argparse.Namespace) -> int:
 
 
 def _gallery(given: argparse.Namespace) -> int:
-    # torch comes with it
+    # imports torch, which most commands do not need
     from traitbrdf.pictures import sheet
 
     library, space = tb.default_library(), tb.default_traits()
@@ -432,11 +439,11 @@ def _gallery(given: argparse.Namespace) -> int:
     for name in held or ():
         space.held(name)
     environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
-    given.out.parent.mkdir(parents=True, exist_ok=True)  # rather than fail after the work
+    given.out.parent.mkdir(parents=True, exist_ok=True)  # fail before the work, not after it
     rows: dict[str, list[tb.TabulatedBRDF]] = {}
     columns = [f"{step:+.2f}" for step in steps] if traits else []
     if given.table:
-        # a column's label is as wide as a sphere: the end of a name says what it is
+        # a label is as wide as a sphere, so the material's name replaces the middle label
         middle = len(steps) // 2
         titles = [[*columns[:middle], name, *columns[middle + 1 :]] for name in names]
         columns = [label for title in titles for label in title] if traits else list(names)
@@ -460,7 +467,7 @@ def _gallery(given: argparse.Namespace) -> int:
 
 def _studio(given: argparse.Namespace) -> int:
     need_packages()
-    # a web server, which no other command needs
+    # imports a web server, which no other command needs
     from traitbrdf.studio.page import Server
     from traitbrdf.studio.session import Session
 
@@ -474,7 +481,7 @@ def _studio(given: argparse.Namespace) -> int:
         edit.assign(list(edit.scene.shape.parts), given.material)
     session = Session(edit)
     server = Server(session, given.port)
-    print(f"{server.url}\nCtrl+C ends it; designs are saved in {session.folder}", flush=True)
+    print(f"{server.url}\nCtrl+C stops it; designs are saved in {session.folder}", flush=True)
     if not given.no_browser:
         threading.Timer(0.5, webbrowser.open, (server.url,)).start()
     server.run()
@@ -490,7 +497,7 @@ def _info(given: argparse.Namespace) -> int:
         print(f"library: {len(library)} materials of {len(set(library.families))} families")
         grey, colour = embedding.n_components
         print(
-            f"embedding: {embedding.size} coordinates ({grey} grey, twice {colour} of colour), "
+            f"embedding: {embedding.size} coordinates ({grey} grey, 2 x {colour} colour), "
             f"{100 * kept:.2f} % of the variance of log f, grid {embedding.grid_.shape}"
         )
         print(f"traits: {', '.join(space.names)}")
@@ -526,7 +533,7 @@ def _info(given: argparse.Namespace) -> int:
 
 
 def _bench(given: argparse.Namespace) -> int:
-    # loaded where it is asked for: torch and all the rest come with it
+    # imports torch and everything else, which other commands do not need
     from traitbrdf.bench.datasets import default_data
     from traitbrdf.bench.run import BENCHES, Bench, run
     from traitbrdf.bench.trade import trade
@@ -543,7 +550,7 @@ def _bench(given: argparse.Namespace) -> int:
         given.json.parent.mkdir(parents=True, exist_ok=True)
     data = given.data or default_data()
     if data is None:
-        print("no folder of real maps and materials: under the procedural sky, without RGL")
+        print("no folder of real maps and materials: using the procedural sky, without RGL")
     records = run(names, data, given.quick, lambda line: print(line, flush=True), benches)
     if given.json is not None:
         given.json.write_text(json.dumps([r.as_dict() for r in records], indent=1) + "\n")

@@ -1,18 +1,18 @@
 """Unit directions, shading frames, half/difference angles and the lat-long sphere.
 
-Conventions of the whole package, stated here once:
+These conventions hold in the whole package:
 
-- ``wi`` points to the light and ``wo`` to the viewer; both are unit vectors of shape
+- ``wi`` points to the light and ``wo`` to the viewer. Both are unit vectors of shape
   ``(..., 3)``. In a *local* frame +z is the surface normal.
 - Half/difference angles follow Rusinkiewicz, "A New Change of Variables for Efficient BRDF
-  Representation" (1998): ``h`` is the normalised sum of ``wi`` and ``wo``; ``theta_h`` in
-  [0, pi/2] is its angle to the normal; ``theta_d`` in [0, pi/2] and ``phi_d`` are the polar angles
-  of ``wi`` in the frame whose z axis is ``h`` and whose x axis lies in the plane of ``h`` and the
-  normal, pointing away from the normal. Radians everywhere.
-- Angles come from ``atan2``, never ``acos``: in float32 ``acos`` loses everything below 2e-4 rad,
-  which is the first node of a MERL table.
-- The world is y up. A lat-long image has row 0 at the top (+y); its centre is -z and right of the
-  centre is +x (right-handed).
+  Representation" (1998). The half vector ``h`` is the normalised sum of ``wi`` and ``wo``;
+  ``theta_h`` in [0, pi/2] is its angle to the normal; ``theta_d`` in [0, pi/2] and ``phi_d`` are
+  the polar angles of ``wi`` in the frame whose z axis is ``h`` and whose x axis lies in the plane
+  of ``h`` and the normal, pointing away from the normal. All angles are in radians.
+- Angles are computed with ``atan2``, never ``acos``: in float32 ``acos`` cannot resolve angles
+  below 2e-4 rad, which is the first node of a MERL table.
+- The world is y up. A lat-long image has row 0 at the top (+y). Its centre shows -z, and +x lies
+  to the right of the centre (right-handed).
 """
 
 from __future__ import annotations
@@ -29,18 +29,30 @@ Array = NDArray[np.floating[Any]]
 def as_directions(value: ArrayLike, name: str) -> Array:
     """Return `value` as a floating ``(..., 3)`` array of unit vectors.
 
+    Parameters
+    ----------
+    value : (..., 3) array_like
+        Unit vectors; integers become float64.
+    name : str
+        Name of the argument, for error messages.
+
+    Returns
+    -------
+    (..., 3) array
+        `value` itself where it is a floating array already.
+
     Raises
     ------
     ValueError
-        If the last axis is not 3, a component is not finite, or a vector is not of unit length
-        within 1e-3.
+        If the last axis is not 3, a component is not finite, or a length differs from 1 by more
+        than 1e-3.
     """
     w = np.asarray(value)
     if not np.issubdtype(w.dtype, np.floating):
         w = w.astype(np.float64)
     if w.ndim == 0 or w.shape[-1] != 3:
         raise ValueError(f"{name}: expected directions of shape (..., 3), got shape {w.shape}")
-    with np.errstate(over="ignore"):  # an infinite length is refused below
+    with np.errstate(over="ignore"):  # the test below rejects an infinite length
         length = np.sqrt(np.sum(w * w, axis=-1))
     if not np.all(np.abs(length - 1.0) < 1e-3):  # NaN fails this as well
         raise ValueError(
@@ -51,18 +63,18 @@ def as_directions(value: ArrayLike, name: str) -> Array:
 
 
 def half_diff_angles(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
-    """Half/difference angles of direction pairs in the local frame.
+    """Return the half/difference angles of direction pairs in the local frame.
 
     Parameters
     ----------
     wi, wo : (..., 3) array
-        Unit directions to the light and to the viewer, +z the normal.
+        Unit directions to the light and to the viewer; +z is the normal.
 
     Returns
     -------
     theta_h, theta_d, phi_d : (...) arrays
-        Radians; ``theta_h`` in [0, pi], ``theta_d`` in [0, pi/2], ``phi_d`` in (-pi, pi].
-        For ``wi == -wo`` the half vector is undefined and taken to be the normal.
+        Radians; ``theta_h`` in [0, pi], ``theta_d`` in [0, pi/2], ``phi_d`` in (-pi, pi]. For
+        ``wi == -wo`` the half vector is undefined, and the normal takes its place.
     """
     total = wi + wo
     length = np.sqrt(np.sum(total * total, axis=-1))
@@ -85,9 +97,19 @@ def half_diff_angles(wi: Array, wo: Array) -> tuple[Array, Array, Array]:
 def from_half_diff_angles(
     theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike, phi_h: ArrayLike = 0.0
 ) -> tuple[Array, Array]:
-    """Directions ``wi, wo`` of shape (..., 3) with the given half/difference angles (radians).
+    """Return directions with the given half/difference angles: the inverse of `half_diff_angles`.
 
-    The inverse of `half_diff_angles`; `phi_h` turns the pair about the normal.
+    Parameters
+    ----------
+    theta_h, theta_d, phi_d : (...) array_like
+        Half/difference angles in radians; they broadcast.
+    phi_h : (...) array_like
+        Azimuth of the half vector about the normal, in radians.
+
+    Returns
+    -------
+    wi, wo : (..., 3) arrays
+        Unit directions in the local frame.
     """
     th, td, pd = np.broadcast_arrays(theta_h, theta_d, phi_d)
     if not np.issubdtype(th.dtype, np.floating):
@@ -105,16 +127,25 @@ def from_half_diff_angles(
 
 
 def fold_phi_d(phi_d: Array) -> Array:
-    """Fold ``phi_d`` to [0, pi/2], by reciprocity (period pi) and mirror symmetry."""
+    """Fold ``phi_d`` (radians) to [0, pi/2], by reciprocity (period pi) and mirror symmetry."""
     folded = np.mod(phi_d, math.pi)
     return np.minimum(folded, math.pi - folded)
 
 
 def shading_frame(normal: Array) -> tuple[Array, Array]:
-    """Two unit tangents (..., 3) that complete unit normals (..., 3) to a right-handed frame.
+    """Return two unit tangents that complete unit normals to a right-handed frame.
 
-    Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017), listing 3: no branch
+    Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017), listing 3. It has no branch
     that loses precision near the poles.
+
+    Parameters
+    ----------
+    normal : (..., 3) array
+        Unit normals.
+
+    Returns
+    -------
+    tangent, bitangent : (..., 3) arrays
     """
     x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
     sign = np.copysign(1.0, z)
@@ -126,7 +157,7 @@ def shading_frame(normal: Array) -> tuple[Array, Array]:
 
 
 def to_local(w: Array, normal: Array) -> Array:
-    """World directions (..., 3) in the local frames of unit normals (..., 3)."""
+    """Express world directions `w` (..., 3) in the local frames of unit `normal` (..., 3)."""
     tangent, bitangent = shading_frame(normal)
     return np.stack(
         [np.sum(w * tangent, -1), np.sum(w * bitangent, -1), np.sum(w * normal, -1)], axis=-1
@@ -134,23 +165,29 @@ def to_local(w: Array, normal: Array) -> Array:
 
 
 def to_world(w: Array, normal: Array) -> Array:
-    """Local directions (..., 3) of the frames of unit normals (..., 3) in the world."""
+    """Turn local directions `w` (..., 3), in the frames of unit `normal` (..., 3), to the world."""
     tangent, bitangent = shading_frame(normal)
     return w[..., :1] * tangent + w[..., 1:2] * bitangent + w[..., 2:3] * normal
 
 
 def reflect(w: Array, normal: Array) -> Array:
-    """Mirror unit directions (..., 3) about unit normals (..., 3)."""
+    """Mirror unit directions `w` (..., 3) about unit normals `normal` (..., 3)."""
     mirrored: Array = 2.0 * np.sum(w * normal, axis=-1, keepdims=True) * normal - w
     return mirrored
 
 
 def latlong_to_direction(u: ArrayLike, v: ArrayLike) -> Array:
-    """World directions (..., 3) at the lat-long image position (u, v).
+    """Return world directions (..., 3) at the lat-long image position (u, v).
 
-    `u` in [0, 1] runs from left to right, `v` in [0, 1] from the top (+y) to the bottom. This is
-    Ramamoorthi & Hanrahan's mapping x = -sin(theta) sin(phi), y = -cos(theta),
-    z = sin(theta) cos(phi), whose theta = pi (1 - v) counts from -y and whose phi = 2 pi u.
+    This is the mapping of Ramamoorthi & Hanrahan: x = -sin(theta) sin(phi), y = -cos(theta),
+    z = sin(theta) cos(phi), where theta = pi (1 - v) is measured from -y and phi = 2 pi u.
+
+    Parameters
+    ----------
+    u : (...) array_like
+        Position in [0, 1] from left to right.
+    v : (...) array_like
+        Position in [0, 1] from the top (+y) to the bottom.
     """
     uu, vv = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     phi, polar = 2.0 * math.pi * uu, math.pi * vv
@@ -159,7 +196,7 @@ def latlong_to_direction(u: ArrayLike, v: ArrayLike) -> Array:
 
 
 def direction_to_latlong(w: ArrayLike) -> tuple[Array, Array]:
-    """Lat-long image position (u, v) of world directions (..., 3), both in [0, 1]."""
+    """Return lat-long image positions (u, v) in [0, 1] of world directions `w` (..., 3)."""
     d = np.asarray(w)
     u = (np.arctan2(d[..., 0], -d[..., 2]) + math.pi) / (2.0 * math.pi)
     v = np.arctan2(np.hypot(d[..., 0], d[..., 2]), d[..., 1]) / math.pi

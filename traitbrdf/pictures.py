@@ -1,4 +1,4 @@
-"""Pictures of materials side by side, and of the angles that a scene shows of them."""
+"""Pictures: materials side by side on spheres, and maps of the angles that a scene shows."""
 
 from __future__ import annotations
 
@@ -21,24 +21,28 @@ if TYPE_CHECKING:
     from traitbrdf.transport.angles import AnglesSeen
 
 Float32 = NDArray[np.float32]
-_PAPER = 209  # sRGB byte of what is around the spheres
-_LINE = 15  # pixels of a line of text
+_PAPER = 209  # sRGB byte of the background
+_LINE = 15  # height of a line of text in pixels
 
 
 def spheres(
     tables: Sequence[TabulatedBRDF], environment: EnvironmentMap | None = None, size: int = 96
 ) -> Float32:
-    """Linear radiance (n, size, size, 3) of a sphere of each table, 0 around it.
+    """Render a sphere of each table, in linear radiance (n, size, size, 3), 0 around it.
 
     Parameters
     ----------
-    tables : n tables of one folded grid
-    environment : None is the procedural sky
+    tables : sequence of n TabulatedBRDF
+        All on one folded grid.
+    environment : EnvironmentMap or None
+        None is the procedural sky.
+    size : int
+        Pixels on a side.
 
     Raises
     ------
     ValueError
-        If there are none, or their grids differ.
+        If there are no tables, or their grids differ.
     """
     if not tables or any(table.grid != tables[0].grid for table in tables):
         raise ValueError(f"tables: expected one or more of one grid, got {len(tables)}")
@@ -51,7 +55,16 @@ def spheres(
 
 
 def own_colours(images: Float32) -> Float32:
-    """(m, B, 3) of images (m, 3, 3 B): each colour of the light under its own channel."""
+    """Return the colour (m, B, 3) of `images` (m, 3, 3 B) lit by each colour of the light.
+
+    `images` holds every channel of the table under every colour of the light; the result keeps the
+    pairs of equal channels.
+
+    Parameters
+    ----------
+    images : (m, 3, 3 B) array
+        Axes: pixels, colours of the light, and the channels of B tables.
+    """
     each = images.reshape(*images.shape[:2], images.shape[2] // 3, 3)
     return np.ascontiguousarray(np.einsum("mcbc->mbc", each))
 
@@ -72,13 +85,16 @@ def sheet(
     environment: EnvironmentMap | None = None,
     size: int = 96,
 ) -> NDArray[np.uint8]:
-    """A sheet (H, W, 3) of sRGB bytes: a row of spheres for each label, all exposed alike.
+    """Draw a sheet (H, W, 3) of sRGB bytes: a row of spheres for each label, with one exposure.
 
     Parameters
     ----------
-    rows : tables of one grid by the label of their row
-    columns : labels above the columns
-    environment, size : as for `spheres`
+    rows : mapping of str to sequence of TabulatedBRDF
+        The tables of each row, all on one grid, by the row's label.
+    columns : sequence of str
+        Labels above the columns.
+    environment, size
+        As for `spheres`.
     """
     tables = [table for row in rows.values() for table in row]
     images = spheres(tables, environment, size)
@@ -103,15 +119,24 @@ def sheet(
 
 
 def angle_map(seen: AnglesSeen, height: int = 360) -> NDArray[np.uint8]:
-    """A picture (H, W, 3), sRGB bytes, of the angles of a BRDF that a scene shows: the brighter the
-    more light is reflected by them, over four decades; white where nothing is seen."""
+    """Draw a picture (H, W, 3) of sRGB bytes of the BRDF angles that a scene shows.
+
+    An angle is the brighter, over four decades, the more light the scene reflects by it; white
+    angles do not occur.
+
+    Parameters
+    ----------
+    seen : traitbrdf.transport.angles.AnglesSeen
+    height : int
+        Pixels of the map's side.
+    """
     grid = seen.grid
     theta_h, theta_d = np.degrees(grid.theta_h), np.degrees(grid.theta_d)
     decades = np.log10(np.maximum(seen.density, 1e-30))
     level = np.clip(1.0 + decades / 4.0, 0.0, 1.0)[..., None]
     ink = 255.0 * np.clip(level * [2.2, 1.5, 1.1] - [0.0, 0.35, 0.6], 0.0, 1.0)
     colour = np.where(level > 0.0, ink, 255.0).astype(np.uint8)
-    # an axis each of degrees, theta_h upwards
+    # both axes in degrees, theta_h upwards
     degrees = (np.arange(height) + 0.5) * 90.0 / height
     up = np.abs(theta_h[None, :] - degrees[::-1, None]).argmin(axis=1)
     along = np.abs(theta_d[None, :] - degrees[:, None]).argmin(axis=1)
@@ -127,7 +152,7 @@ def angle_map(seen: AnglesSeen, height: int = 360) -> NDArray[np.uint8]:
     draw.text((left + height // 2, top + height + 24), "theta_d", fill=(0, 0, 0), anchor="ma")
     draw.text((4, top + height // 2), "theta_h", fill=(0, 0, 0), anchor="lm")
     most = seen.within(0.9)
-    told = f"{100.0 * seen.cells:.0f} % of the angles show; 90 % of the light: theta_h below "
-    told += f"{most[0]:.0f}, theta_d below {most[1]:.0f}"
-    draw.text((4, 4), told, fill=(0, 0, 0))
+    caption = f"{100.0 * seen.cells:.0f} % of the angles show; 90 % of the light: theta_h below "
+    caption += f"{most[0]:.0f}, theta_d below {most[1]:.0f}"
+    draw.text((4, 4), caption, fill=(0, 0, 0))
     return np.asarray(paper)

@@ -1,1 +1,1 @@
-"""Measurement: accuracy and speed, side by side. A leaf: the command line alone imports it."""
+"""Benchmarks: errors and times, measured against the reference."""

@@ -1,4 +1,4 @@
-"""What is measured on: maps, materials that no fit has seen, measured ones."""
+"""Data for the benches: maps, unseen materials and measured materials."""
 
 from __future__ import annotations
 
@@ -29,17 +29,24 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 HELD_OUT = 10
-"""Every tenth library member is kept out of the bases that are measured."""
+"""Every `HELD_OUT`-th library member is left out of the training of measured bases."""
 
 LEFT_OUT = ("polished-metal", "car-paint", "rubber", "silk", "velvet", "dusty")
-"""Families that are left out of training in turn."""
+"""Families that are left out of training, one at a time."""
 
 
-# -- what is measured on --------------------------------------------------------------------------
+# -- maps and materials ---------------------------------------------------------------------------
 
 
 def maps(data: Path | None, quick: bool) -> list[tuple[str, EnvironmentMap]]:
-    """The maps of ``data/envmaps``; without that folder the procedural sky, plain and turned."""
+    """Return named maps: those of ``data/envmaps``, or else the procedural sky, plain and turned.
+
+    Parameters
+    ----------
+    data : Path or None
+    quick : bool
+        Whether to return one map only.
+    """
     files = sorted((data / "envmaps").glob("*.exr")) if data else []
     if not files:
         sky = EnvironmentMap.sky()
@@ -48,7 +55,14 @@ def maps(data: Path | None, quick: bool) -> list[tuple[str, EnvironmentMap]]:
 
 
 def training_set(library: Library, quick: bool) -> Training:
-    """What a session trains its bases with, but for every tenth member; a third of it if quick."""
+    """Return what a session trains its bases with, without the members that are held out.
+
+    Parameters
+    ----------
+    library : Library
+    quick : bool
+        Whether to use only a third of it.
+    """
     members = trained_members(library)
     kept = [library.coordinates[i] for i in members if i % HELD_OUT]
     channels = [library.embedding.decode_values(z) for z in (kept[::3] if quick else kept)]
@@ -59,20 +73,37 @@ def training_set(library: Library, quick: bool) -> Training:
 
 
 def fresh_recipes(count: int, seed: int = 1) -> list[TabulatedBRDF]:
-    """Materials of all families that the library was not made of: its recipe with another seed."""
+    """Return tables of materials of all families that are not in the library.
+
+    They come from the library's recipe with another seed.
+
+    Parameters
+    ----------
+    count : int
+    seed : int
+        Not the library's seed, 0.
+    """
     grid = default_library().embedding.grid_
-    # the curated materials come first and are the same for every seed
+    # the anchors come first and are the same for every seed
     drawn = zip(materials(seed, count + 100), materials(seed + 1, count + 100), strict=True)
     new = [material for material, other in drawn if material.model != other.model][:count]
     return [TabulatedBRDF.from_model(m.model, grid, f"{m.family} {m.name}") for m in new]
 
 
 def unseen(data: Path | None, quick: bool = False, seed: int = 0) -> dict[str, list[TabulatedBRDF]]:
-    """Some 200 tables (20 if quick) that no basis was fitted to, by kind.
+    """Return some 200 tables (20 if quick) that no basis was fitted to, by kind.
 
-    Held-out library members; new members of every family; trait moves of held-out members, two
-    traits at a time, amounts to +-2; closed forms at the parameters of the literature; and the
-    measured materials of ``data/rgl``. Where new members cannot be made, there are more moves.
+    The kinds are: held-out library members; new members of every family; trait moves of held-out
+    members, two traits at a time, with amounts up to +-2; analytic models at parameters from the
+    literature; and the measured materials of ``data/rgl``. If new members cannot be made, there are
+    more moves.
+
+    Parameters
+    ----------
+    data : Path or None
+    quick : bool
+    seed : int
+        Seed of the random choices.
     """
     library, space = default_library(), default_traits()
     embedding, grid = library.embedding, library.embedding.grid_
@@ -110,19 +141,27 @@ def unseen(data: Path | None, quick: bool = False, seed: int = 0) -> dict[str, l
 
 
 def channels(tables: Sequence[TabulatedBRDF]) -> Float32:
-    """(cells, 3 B) of B tables, each colour channel a column."""
+    """Return the B tables `tables` as one array (cells, 3 B): each colour channel is a column."""
     flat = [table.values.reshape(-1, 3).astype(np.float32) for table in tables]
     return np.concatenate(flat, axis=1)
 
 
 MEASURED_WITHIN = math.radians(75.0)
-"""Beyond this angle measurements are extrapolated or unreliable."""
+"""Greatest angle to the normal, in radians, at which measurements are reliable."""
 
 
 @dataclass(frozen=True)
 class MeasuredSet:
-    """Measured materials by name, each (n, 3) in 1/sr (negative: invalid) at the same angles (n,),
-    in radians."""
+    """Measured materials at common angles.
+
+    Parameters
+    ----------
+    name : str
+    angles : theta_h, theta_d, phi_d, each (n,)
+        Radians.
+    materials : dict of (n, 3) arrays by name
+        f_r in 1/sr; negative values are invalid.
+    """
 
     name: str
     angles: tuple[Float64, Float64, Float64]
@@ -130,7 +169,17 @@ class MeasuredSet:
 
 
 def measured_sets(data: Path, n_theta_d: int = 24, n_phi_d: int = 9) -> list[MeasuredSet]:
-    """MERL slices (phi_d 90 degrees) and RGL materials (all angles), within `MEASURED_WITHIN`."""
+    """Return MERL slices (phi_d 90 degrees) and RGL materials (all angles).
+
+    Only angles within `MEASURED_WITHIN` of the normal are used.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with merl_slices/ and rgl/.
+    n_theta_d, n_phi_d : int
+        Numbers of angles at which RGL materials are sampled.
+    """
     theta_h = (np.arange(90) / 90) ** 2 * math.pi / 2
     h, d = np.meshgrid(theta_h, np.arange(90) / 90 * math.pi / 2, indexing="ij")
     trusted = np.cos(h) * np.cos(d) > math.cos(MEASURED_WITHIN)
@@ -154,7 +203,10 @@ def measured_sets(data: Path, n_theta_d: int = 24, n_phi_d: int = 9) -> list[Mea
 
 
 def default_data() -> Path | None:
-    """The folder of maps and measured materials: $TRAITBRDF_SHARED, or ../shared/data."""
+    """Return the folder of maps and measured materials: $TRAITBRDF_SHARED, or ../shared/data.
+
+    None if neither exists.
+    """
     for place in (os.environ.get("TRAITBRDF_SHARED"), "../shared/data"):
         if place and (Path(place) / "envmaps").is_dir():
             return Path(place)

@@ -40,7 +40,13 @@ Float64 = NDArray[np.float64]
 
 
 def edit_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Edits to finished frames, beside the plain sum over environment texels."""
+    """Time edits to finished frames, and the plain sum over environment texels.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, repeats, checked = (64, 8, 4) if quick else (512, 40, 48)
     name, environment = maps(data, True)[0]
     session = EditSession(bench_scene(environment, size), cache=False)
@@ -66,7 +72,7 @@ def _edits(
     part: float | None,
     say: Say,
 ) -> Iterator[Record]:
-    """Edit times of a session to be prepared; `whole` and `part` are targets in ms."""
+    """Time the edits of an unprepared session; `whole` and `part` are targets in ms."""
     scene, space = session.scene, session.traits
     named = f"{scene.width}x{scene.height}"
     start = time.perf_counter()
@@ -81,7 +87,7 @@ def _edits(
     objects = list(scene.shape.parts)
 
     def nearby() -> Float64:
-        """Coordinates a small random move away: some tenth of a trait unit."""
+        """Return coordinates a small random step away: about a tenth of a trait unit."""
         step = rng.normal(size=len(home))
         return np.asarray(home + 0.05 * step * (session.embedding.high_ - session.embedding.low_)
                           / np.sqrt(len(home)))  # fmt: skip
@@ -94,7 +100,7 @@ def _edits(
             session.assign(name, nearby())
 
     def moved(name: str) -> Callable[[], None]:
-        # never the same twice: what was shown lately need not be shaded again
+        # never the same amount twice, because recent frames are cached
         amounts = ((-1) ** k * (0.05 + 1e-4 * k) for k in itertools.count())
         return lambda: session.move(name, hold=("colour",), shiny=next(amounts))
 
@@ -108,7 +114,7 @@ def _edits(
     records = []
     for label, edit, target in edits:
         session.assign(objects, "blue-plastic")
-        # what the basis has to learn first is learnt by now
+        # warm up: the basis may have to learn the material first
         for _ in range(3):
             edit()
             session.render()
@@ -121,7 +127,7 @@ def _edits(
             times.append(time.perf_counter() - start)
         report = session.report()
         exact = report["exact_frames"] - before["exact_frames"]
-        error = _frame_error(session, checked, rng)
+        error = frame_error(session, checked, rng)
         tiers = sorted({entry["tier"] for entry in report["parts"].values()})
         value = 1e3 * float(np.median(times))
         said = (
@@ -139,8 +145,16 @@ def _edits(
     yield Record(f"preparation, {named}", prepared, "s", error=records[0].error, how=how)
 
 
-def _frame_error(session: EditSession, count: int, rng: np.random.Generator) -> float:
-    """Error of the session's frame against the oracle, on some covered pixels."""
+def frame_error(session: EditSession, count: int, rng: np.random.Generator) -> float:
+    """Return the error of a session's frame against the oracle, on some covered pixels.
+
+    Parameters
+    ----------
+    session : EditSession
+    count : int
+        Number of pixels.
+    rng : numpy.random.Generator
+    """
     scene = session.scene
     pixels = np.unique(scene.pixels[rng.choice(len(scene.pixels), count, replace=False)])
     index = np.flatnonzero(np.isin(scene.pixels, pixels))
@@ -162,7 +176,13 @@ def _frame_error(session: EditSession, count: int, rng: np.random.Generator) -> 
 
 
 def preparation(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Preparation of a scene, in a fresh process: time, memory, the cache, and first images."""
+    """Measure the preparation of a scene in a new process: time, memory, cache, first images.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size = 64 if quick else 512
     name, environment = maps(data, True)[0]
     context = multiprocessing.get_context("spawn")
@@ -194,14 +214,14 @@ def preparation(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def _prepare_afresh(environment: EnvironmentMap, size: int, folder: str) -> dict[str, Any]:
-    """What `preparation` reports, measured in a process that did nothing before."""
+    """Return the figures for `preparation`, measured in a process that has done nothing before."""
     os.environ["TRAITBRDF_CACHE"] = folder
     os.environ["TRAITBRDF_CACHE_BYTES"] = str(CACHE_BYTES)
     library = default_library()
     start = time.perf_counter()
     training_of(library, 0)
     training = time.perf_counter() - start
-    # compiled code is loaded (or compiled) at its first use
+    # warm up: compiled code is loaded (or compiled) at its first use
     warm = EditSession(bench_scene(EnvironmentMap.sky(rows=32), 16), cache=False)
     warm.render()
     warm.draft()
@@ -210,7 +230,7 @@ def _prepare_afresh(environment: EnvironmentMap, size: int, folder: str) -> dict
     start = time.perf_counter()
     transport = session.prepare()
     prepared = time.perf_counter() - start
-    peak = _peak_memory()
+    peak = peak_memory()
     for thread in threading.enumerate():
         if thread.name == "traitbrdf-cache":
             thread.join()
@@ -244,10 +264,10 @@ def _prepare_afresh(environment: EnvironmentMap, size: int, folder: str) -> dict
     return found
 
 
-def _peak_memory() -> float | None:
-    """Most memory that this process ever had, in GB; None where the system does not tell.
+def peak_memory() -> float | None:
+    """Return the peak memory of this process in GB; None if the system does not report it.
 
-    Not by getrusage where it can be helped: Linux hands a parent's peak on to its children.
+    getrusage is only the fallback: on Linux, children inherit the peak of their parent.
     """
     status = Path("/proc/self/status")
     if status.exists():

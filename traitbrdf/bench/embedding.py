@@ -31,7 +31,13 @@ from traitbrdf.space.library import default_library
 
 
 def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Table error: what tabulating a closed form costs, apart from all transport."""
+    """Measure table error: the error of tabulating an analytic BRDF, apart from all transport.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, count = (48, 4) if quick else (128, 100)
     grid = default_library().embedding.grid_
     closed: list[Any] = [
@@ -64,8 +70,15 @@ def table_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Embedding error: measured materials that the library knows nothing of, rendered ones, what
-    random coordinates look like, and decoding times."""
+    """Measure embedding error: measured materials, rendered ones, random coordinates, decode times.
+
+    The library has not been fitted to any of the materials.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     library = default_library()
     embedding = library.embedding
     grid, k = embedding.grid_, embedding.size
@@ -122,7 +135,7 @@ def embedding_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record
 def _rendered_error(
     embedding: BRDFEmbedding, data: Path | None, quick: bool, say: Say
 ) -> Iterator[Record]:
-    """A sphere of materials that were encoded, beside the sphere of the materials themselves."""
+    """Compare spheres of encoded materials with spheres of the materials themselves."""
     every = dict(maps(data, quick))
     three = {name: every[name] for name in RENDERED_UNDER if name in every} or every
     size = 32 if quick else 96
@@ -130,7 +143,7 @@ def _rendered_error(
     files = sorted((data / "rgl").glob("*.bsdf")) if data else []
     sets = {
         "RGL": [TabulatedBRDF.from_model(MeasuredBRDF.read(f), grid, f.stem) for f in files],
-        # two of every family: members that the library would have under another seed
+        # two of every family, as the library would have them with another seed
         "held-out library": fresh_recipes(4 if quick else 68, seed=2),
     }
     for kind, tables in sets.items():
@@ -159,7 +172,7 @@ def _rendered_error(
 
 
 def _gamut(embedding: BRDFEmbedding, count: int) -> Iterator[Record]:
-    """Random coordinates of the gamut box: passive, and without holes in their highlights."""
+    """Check random coordinates of the gamut box: passive, and no holes in their highlights."""
     rng = np.random.default_rng(0)
     grid = embedding.grid_
     rows = albedo_operator(grid, ALBEDO_ANGLES)
@@ -177,4 +190,4 @@ def _gamut(embedding: BRDFEmbedding, count: int) -> Iterator[Record]:
 
 
 RENDERED_UNDER = ("forest", "studio", "sunset")
-"""Maps of a forest, of lamps indoors, of a low sun."""
+"""Maps of a forest, of lamps indoors and of a low sun."""

@@ -1,4 +1,4 @@
-"""How far a BRDF or a picture is off."""
+"""Errors of BRDFs and of pictures."""
 
 from __future__ import annotations
 
@@ -34,9 +34,26 @@ def spheres_compared(
     environments: Sequence[EnvironmentMap],
     size: int,
 ) -> tuple[Float64, Float64, Float64]:
-    """A sphere of each table beside one of what is shown of it, (maps, tables) each: linear PSNR
-    in dB (peak: the brightest of the image), that of the exposed and clipped picture (peak 1; nine
-    tenths of the pixels are below 0.8), and mean relative L1."""
+    """Compare spheres of tables with spheres of their approximations.
+
+    Parameters
+    ----------
+    tables, shown : sequences of TabulatedBRDF
+        The true tables and their approximations, all on one folded grid.
+    environments : sequence of EnvironmentMap
+    size : int
+        Pixels on a side.
+
+    Returns
+    -------
+    linear : (maps, tables) array
+        PSNR of linear radiance in dB; the peak is the brightest value of the image.
+    exposed : (maps, tables) array
+        PSNR in dB of the exposed and clipped picture; the peak is 1, and nine tenths of the pixels
+        are below 0.8.
+    error : (maps, tables) array
+        Mean relative L1.
+    """
     linear, exposed, error = np.empty((3, len(environments), len(tables)))
     for m, environment in enumerate(environments):
         operator = Operator(Scene(sphere(), environment, size=size), tables[0].grid)
@@ -51,16 +68,23 @@ def spheres_compared(
 
 
 def decibels(peak: float, square: float) -> float:
-    """PSNR of a mean squared difference."""
+    """Return the PSNR in dB of a mean squared difference `square`, relative to `peak`."""
     return 10.0 * math.log10(peak**2 / max(square, 1e-20))
 
 
 def highlight_hole(grid: HalfDiffGrid, values: NDArray[Any]) -> float:
-    """The deepest valley in a highlight of f (cells, 3): what f is lower by there, relative to the
-    lower one of its rims along theta_h.
+    """Return the depth, in [0, 1], of the deepest valley in a highlight.
 
-    The highlight: theta_h to 30 degrees, as far around its brightest node as f exceeds a tenth of
-    it; profiles of theta_d to 60 degrees, both directions within 75 degrees of the normal.
+    The depth is the amount by which f in the valley is lower than the lower of its rims along
+    theta_h, relative to that rim. The highlight is theta_h up to 30 degrees, as far around its
+    brightest node as f exceeds a tenth of it, in profiles of theta_d up to 60 degrees, with both
+    directions within 75 degrees of the normal.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    values : (cells, 3) array
+        f_r in 1/sr.
     """
     kept = (grid.theta_d <= math.radians(60.0)).repeat(grid.n_phi_d)
     nodes = grid.theta_h <= HIGHLIGHT
@@ -82,7 +106,16 @@ def highlight_hole(grid: HalfDiffGrid, values: NDArray[Any]) -> float:
 def log_error(
     embedding: BRDFEmbedding, angles: tuple[Float64, Float64, Float64], rgb: Float64
 ) -> Float64:
-    """|d log(f + 1e-3)| (n, 3) of samples that were encoded and decoded again."""
+    """Return |d log(f + 1e-3)| (n, 3) of samples that are encoded and decoded again.
+
+    Parameters
+    ----------
+    embedding : BRDFEmbedding
+    angles : theta_h, theta_d, phi_d, each (n,)
+        Radians.
+    rgb : (n, 3) array
+        f_r in 1/sr.
+    """
     index, weight = embedding.grid_.stencil(*angles)
     table = embedding.decode_values(embedding.encode_samples(*angles, rgb))
     shown = np.einsum("nk,nkc->nc", weight, table[index])
@@ -91,7 +124,7 @@ def log_error(
 
 
 def milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """Median time of a call, after one that does not count."""
+    """Return the median time of `repeats` calls of `call`, after one warm-up call."""
     call()
     times = []
     for _ in range(repeats):

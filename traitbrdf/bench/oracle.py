@@ -1,4 +1,4 @@
-"""Reference values, on several processes."""
+"""Reference values, computed by several processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Int64 = NDArray[np.int64]
 
 # -- the oracle -----------------------------------------------------------------------------------
 _BRDFS: list[Reflectance] = []
-"""What a process of the oracle computes: it is sent once."""
+"""The BRDFs of a worker process, which receives them once."""
 
 
 def _take_brdfs(brdfs: Sequence[Reflectance]) -> None:
@@ -46,7 +46,7 @@ def _reference_job(job: tuple[Scene, Int64, float]) -> tuple[Float64, Float64]:
 def _fragments(
     scene: Scene, index: Int64, brdfs: Sequence[Reflectance], tolerance: float
 ) -> tuple[Float64, Float64]:
-    """`reference.fragments`, NaN where the tolerance is not reached."""
+    """Return `reference.fragments`, with NaN where the tolerance is not reached."""
     try:
         return reference.fragments(scene, index, brdfs, tolerance)
     except reference.IntegrationError:
@@ -59,15 +59,18 @@ def _fragments(
 
 
 class Oracle:
-    """`reference.fragments` for the same BRDFs again and again, on all cores.
+    """Compute `reference.fragments` for the same BRDFs repeatedly, on all cores.
 
-    Where it refuses (next to grazing views some lobes need too many cells) there is NaN.
+    The result is NaN where the reference fails: next to grazing views some lobes need too many
+    cells.
 
     Parameters
     ----------
-    brdfs : B reflectances
-    tolerance : of each sample, relative to its largest channel
-    cores : processes; one of them is this one, without any other
+    brdfs : sequence of Reflectance
+    tolerance : float
+        Error allowed per sample, relative to its largest channel.
+    cores : int or None
+        Number of processes; None for one per core, 1 to compute in this process.
     """
 
     def __init__(
@@ -86,7 +89,14 @@ class Oracle:
             self._pool.shutdown()
 
     def __call__(self, scene: Scene, index: Int64) -> tuple[Float64, Float64]:
-        """Radiance (m, B, 3) of fragments `index` (m,), and its own error."""
+        """Return the radiance (m, B, 3) of a scene's fragments, and its estimated error.
+
+        Parameters
+        ----------
+        scene : Scene
+        index : (m,) int array
+            Fragments.
+        """
         if self.cores == 1 or len(index) < 32:
             return _fragments(scene, index, self.brdfs, self.tolerance)
         if self._pool is None:
@@ -96,7 +106,7 @@ class Oracle:
                 initializer=_take_brdfs,
                 initargs=(self.brdfs,),
             )
-        # every n-th, so that parts and borders are shared out
+        # every n-th fragment, so that parts and borders are spread over the jobs
         jobs = max(4 * self.cores, len(index) // 16)
         parts = [np.arange(k, len(index), jobs) for k in range(jobs)]
         done = list(
@@ -110,9 +120,18 @@ class Oracle:
 def reference_values(
     scene: Scene, index: Int64, brdfs: Sequence[Reflectance], tolerance: float
 ) -> tuple[Float64, Float64]:
-    """The oracle at fragments `index` (m,) for B BRDFs: (m, B, 3) and its own error; all cores.
+    """Return the oracle's radiance (m, B, 3) of fragments for B BRDFs, and its estimated error.
 
-    NaN where it refuses.
+    NaN where the reference fails.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : (m,) int array
+        Fragments.
+    brdfs : sequence of Reflectance
+    tolerance : float
+        As for `Oracle`.
     """
     with Oracle(brdfs, tolerance) as oracle:
         return oracle(scene, index)
@@ -121,9 +140,18 @@ def reference_values(
 def draw_fragments(
     oracle: Oracle, scene: Scene, among: Int64, count: int, rng: np.random.Generator
 ) -> tuple[Int64, Float64, Float64]:
-    """Random fragments of `among` (m,), what the oracle says of them, and its own error.
+    """Return random fragments, their reference values, and the errors of these.
 
-    Those that it refuses are replaced by others.
+    Fragments at which the reference fails are replaced by others.
+
+    Parameters
+    ----------
+    oracle : Oracle
+    scene : Scene
+    among : (m,) int array
+        Fragments to choose from.
+    count : int
+    rng : numpy.random.Generator
     """
     order = rng.permutation(among)
     index = np.sort(order[: count + count // 20])
@@ -133,7 +161,7 @@ def draw_fragments(
 
 
 def relative_errors(shown: NDArray[Any], true: Float64) -> Float64:
-    """(B,) mean relative L1 of radiance (m, B, 3)."""
+    """Return the mean relative L1 (B,) of radiance `shown` against `true`, both (m, B, 3)."""
     return np.array(
         [reference.relative_error(shown[:, b], true[:, b]) for b in range(true.shape[1])]
     )
@@ -144,17 +172,27 @@ def relative_errors(shown: NDArray[Any], true: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class _Shown:
-    """Fragments (m,) under B tables: by the basis, and as a session would show them."""
+    """Radiance of fragments (m,) under B tables: from the basis, and as a session shows it."""
 
     basis: Float32  # (m, B, 3)
     final: Float32  # (m, B, 3)
     measured: Float64  # (parts, B) measured error of each part's basis frame
-    refused: NDArray[np.bool_]  # (parts, B) where a session does not trust the basis
+    refused: NDArray[np.bool_]  # (parts, B) whether a session would render the part exactly
 
 
 def shown_errors(transport: Transport, tables: Sequence[TabulatedBRDF], index: Int64) -> _Shown:
-    """What is shown of tables that are assigned one after the other, to a session that learns
-    nothing from them: by the basis where its measured error is small, exactly elsewhere."""
+    """Return what a session shows of tables that are assigned one after the other.
+
+    It uses the basis where the measured error is small, and exact shading elsewhere. The session
+    learns nothing from the tables.
+
+    Parameters
+    ----------
+    transport : Transport
+    tables : sequence of TabulatedBRDF
+    index : (m,) int array
+        Fragments.
+    """
     scene = transport.scene
     whole = np.empty((len(scene.pixels), len(tables), 3), np.float32)
     measured = np.zeros((len(scene.parts), len(tables)))

@@ -1,14 +1,14 @@
-"""Mitsuba 3, an independent path tracer: our scene, table, map and camera as its own.
+"""Mitsuba 3, an independent path tracer, with our scene, table, map and camera.
 
-What `tests/test_peers.py` checks the oracle against, and what ``traitbrdf bench peers`` times edits
-beside. Nothing of the integral is shared: it has its own rays and shading frames, the look-up of
-the table is written a second time, and the rest is Monte Carlo.
+`tests/test_peers.py` checks the oracle against it, and ``traitbrdf bench peers`` compares the time
+of edits with it. The two share no part of the integral: Mitsuba has its own rays and shading
+frames, the table look-up is written a second time, and the rest is Monte Carlo.
 
-The package does without Mitsuba (the extra ``peers``): it is imported when `load` is called.
+Mitsuba is optional (the extra ``peers``); `load` imports it.
 
-It runs at the settings that suit it best: stratified samples (its ``multijitter``), the map's
-samples compensated for those of the material (``mis_compensation``), a lobe fitted to each table
-(`fit_lobe`), the table in a buffer that an edit overwrites, so that no kernel is compiled anew.
+Mitsuba runs at its best settings: stratified samples (its ``multijitter``), map samples compensated
+for material samples (``mis_compensation``), a lobe fitted to each table (`fit_lobe`), and the table
+in a buffer that an edit overwrites, so that no kernel is compiled again.
 """
 
 from __future__ import annotations
@@ -33,23 +33,25 @@ Int64 = NDArray[np.int64]
 VARIANT = "llvm_ad_rgb"
 
 FINER = 2
-"""Into so many of its texels on a side a texel of ours is divided, since its map is bilinear.
+"""Each of our texels becomes FINER x FINER texels of Mitsuba's, because its map is bilinear.
 
-The teapot in polished gold under a photographed map is then 0.1 % off, as with 8; with 1 it is
-0.3 %. More only make its map slower to sample.
+With 2 the teapot in polished gold under a photographed map is 0.1 % off, as with 8; with 1 it is
+0.3 % off. Larger values only make its map slower to sample.
 """
 
-_LAUNCH = 1 << 23  # paths at once: less than 1 GB
+PATHS_AT_ONCE = 1 << 23
+"""Paths in one launch; they take less than 1 GB."""
 
 
 @dataclass(frozen=True)
 class Peer:
-    """Mitsuba as it was loaded.
+    """The imported Mitsuba.
 
-    Attributes
+    Parameters
     ----------
-    mi, dr : the modules mitsuba and drjit
-    material : the class that `table_material` made
+    mi, dr : modules mitsuba and drjit
+    material : class
+        The material class that `table_material` made.
     """
 
     mi: Any
@@ -59,18 +61,18 @@ class Peer:
 
 @functools.cache
 def load() -> Peer:
-    """Import Mitsuba and see that it works.
+    """Import Mitsuba and check that it works.
 
     Raises
     ------
     RuntimeError
-        Where it is not installed, or finds no LLVM library.
+        If it is not installed, or finds no LLVM library.
     """
     try:
         dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
         mi.set_variant(VARIANT)
-        mi.set_log_level(mi.LogLevel.Error)  # it would tell of every rounded number of samples
-        dr.eval(mi.Float(1.0) + 1.0)  # without the LLVM library this is what fails
+        mi.set_log_level(mi.LogLevel.Error)  # no message for every rounded number of samples
+        dr.eval(mi.Float(1.0) + 1.0)  # this fails without the LLVM library
     except (ImportError, RuntimeError) as error:
         raise RuntimeError(
             "needs Mitsuba 3 and the LLVM library: pip install 'traitbrdf[peers]', and Debian's "
@@ -80,8 +82,11 @@ def load() -> Peer:
 
 
 def _own(mi: Any, dr: Any, values: NDArray[np.float32]) -> Any:
-    """Numbers in memory of Dr.Jit's own. It would use an array of NumPy's as it lies, and compile
-    kernels anew where one is aligned and the next is not."""
+    """Copy numbers to memory of Dr.Jit's own.
+
+    Dr.Jit would use a NumPy array in place, and compile kernels again whenever the alignment of an
+    array differs from the one before.
+    """
     owned = dr.zeros(mi.Float, values.size)
     dr.scatter(owned, mi.Float(values.ravel()), dr.arange(mi.UInt32, values.size))
     dr.eval(owned)
@@ -92,14 +97,20 @@ def _own(mi: Any, dr: Any, values: NDArray[np.float32]) -> Any:
 
 
 def table_material(mi: Any, dr: Any) -> Any:
-    """A class: a table on a folded grid as a Mitsuba material of two equal sides.
+    """Return a Mitsuba material class for tables on a folded grid, with two equal sides.
 
-    Made from a table, the roughness `alpha` of a GGX lobe and the share `even` of
-    cosine-distributed directions, which are what its samples are drawn from. `assign` takes others
-    of the same grid without a kernel having to be compiled anew.
+    An instance is made from a table, the roughness `alpha` of a GGX lobe and the share `even` of
+    cosine-distributed directions; its samples are drawn from these two. `assign` replaces the table
+    by another on the same grid, without compiling a kernel again.
+
+    Parameters
+    ----------
+    mi, dr : modules mitsuba and drjit
     """
 
     class Table(mi.BSDF):  # type: ignore[misc]
+        """A table on a folded grid as a Mitsuba material."""
+
         def __init__(self, table: TabulatedBRDF, alpha: float, even: float = 0.5) -> None:
             super().__init__(mi.Properties())
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
@@ -108,17 +119,17 @@ def table_material(mi: Any, dr: Any) -> Any:
             self.assign(table, alpha, even)
 
         def assign(self, table: TabulatedBRDF, alpha: float, even: float = 0.5) -> None:
-            """Be another table: the edit."""
+            """Replace the table: this is the edit."""
             if table.grid.layout != "folded" or table.grid.shape != self.counts:
                 raise ValueError(f"table: expected a folded grid {self.counts}, got {table!r}")
-            # four to a node: they are gathered at once
+            # padded to four values per node, which are gathered at once
             padded = np.zeros((table.grid.size, 4), np.float32)
             padded[:, :3] = table.values.reshape(-1, 3)
             self.values = _own(mi, dr, padded)
             self.alpha, self.even = dr.opaque(mi.Float, alpha), dr.opaque(mi.Float, even)
 
         def look_up(self, light: Any, view: Any) -> Any:
-            """Trilinear in theta_h, theta_d, phi_d (Rusinkiewicz 1998), from the angles anew."""
+            """Interpolate the table in theta_h, theta_d, phi_d (Rusinkiewicz 1998)."""
             n_h, n_d, n_p = self.counts
             half = dr.normalize(light + view)
             slant = dr.hypot(half.x, half.y)
@@ -149,19 +160,23 @@ def table_material(mi: Any, dr: Any) -> Any:
             return total
 
         def upright(self, view: Any, light: Any) -> tuple[Any, Any, Any]:
+            """Mirror directions to the upper side, and tell whether both are above the surface."""
             side = dr.sign(view.z)
             view = mi.Vector3f(view.x, view.y, side * view.z)
             light = mi.Vector3f(light.x, light.y, side * light.z)
             return view, light, (view.z > 0) & (light.z > 0)
 
         def spread(self) -> Any:
+            """Return the microfacet distribution that samples are drawn from."""
             return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            """Return f times the cosine."""
             view, light, above = self.upright(si.wi, wo)
             return dr.select(active & above, self.look_up(light, view) * light.z, 0)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            """Return the density of `sample`."""
             view, light, above = self.upright(si.wi, wo)
             half = dr.normalize(view + light)
             lobe = self.spread().pdf(view, half) / (4 * dr.dot(view, half))
@@ -169,9 +184,11 @@ def table_material(mi: Any, dr: Any) -> Any:
             return dr.select(active & above, dr.lerp(lobe, even, self.even), 0)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            """Return `eval` and `pdf`."""
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+            """Draw a direction to the light from the lobe or the cosine distribution."""
             view, _, _ = self.upright(si.wi, si.wi)
             half, _ = self.spread().sample(view, sample2)
             even = mi.warp.square_to_cosine_hemisphere(sample2)
@@ -186,24 +203,30 @@ def table_material(mi: Any, dr: Any) -> Any:
             return drawn, dr.select(drawn.pdf > 0, value / drawn.pdf, 0)
 
         def traverse(self, callback: Any) -> None:
-            pass
+            """Offer no parameters."""
 
         def to_string(self) -> str:
+            """Return a short description."""
             return f"Table{self.counts}"
 
     return Table
 
 
 def fit_lobe(table: TabulatedBRDF) -> tuple[float, float]:
-    """The roughness of a GGX lobe and the share of cosine-distributed directions that, together,
-    draw samples of a table with the least variance under even light.
+    """Fit the sampling density: a GGX lobe mixed with cosine-distributed directions.
+
+    The fit minimises the variance of samples of the table under even light.
+
+    Parameters
+    ----------
+    table : TabulatedBRDF
 
     Returns
     -------
     alpha, even : float
-        As `table_material` takes them.
+        Roughness of the lobe and share of cosine-distributed directions, as for `table_material`.
     """
-    # quadrature over half vectors, dense where lobes are narrow
+    # a quadrature over half vectors that is dense at narrow lobes
     edges = (np.arange(161) / 160) ** 3 * (math.pi / 2)
     theta, step = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     phi = (np.arange(32) + 0.5) * (math.pi / 32)
@@ -236,10 +259,16 @@ def fit_lobe(table: TabulatedBRDF) -> tuple[float, float]:
 
 
 def their_map(mi: Any, environment: EnvironmentMap, finer: int = FINER) -> dict[str, Any]:
-    """A map as an emitter of theirs.
+    """Return a map as a Mitsuba emitter.
 
-    Rows of theirs stand at multiples of pi / (H - 1), columns are centred; u = 0.5 is +z. Theirs
-    is bilinear: every texel becomes `finer` x `finer` texels, which leaves ramps at its edges.
+    Mitsuba's rows are at multiples of pi / (H - 1), its columns are centred, and u = 0.5 is +z. Its
+    map is bilinear: every texel becomes `finer` x `finer` texels, and ramps remain at its edges.
+
+    Parameters
+    ----------
+    mi : module mitsuba
+    environment : EnvironmentMap
+    finer : int
     """
     rows, columns, _ = environment.image.shape
     wide = environment.image.repeat(finer, axis=1)
@@ -257,7 +286,16 @@ def their_map(mi: Any, environment: EnvironmentMap, finer: int = FINER) -> dict[
 
 
 def their_mesh(mi: Any, shape: Mesh, part: int, material: Any) -> Any:
-    """One part of a mesh, with our normals at its corners."""
+    """Return one part of a mesh, with our normals at its corners.
+
+    Parameters
+    ----------
+    mi : module mitsuba
+    shape : Mesh
+    part : int
+        Index of the part.
+    material : instance of the class that `table_material` returns
+    """
     chosen = shape.face_part == part
     corners = shape.faces[chosen]
     normals = shape.normals[corners] if shape.normals.ndim == 2 else shape.normals[chosen]
@@ -274,9 +312,17 @@ def their_mesh(mi: Any, shape: Mesh, part: int, material: Any) -> Any:
 
 
 def their_scene(mi: Any, scene: Scene, material: Any, finer: int = FINER) -> Any:
-    """Our scene in Mitsuba, every part of the one material.
+    """Return our scene in Mitsuba, with one material for every part.
 
-    Theirs lets the ground hide light from the object; in ours it does not.
+    Mitsuba's ground hides light of the map from the object; ours does not.
+
+    Parameters
+    ----------
+    mi : module mitsuba
+    scene : Scene
+    material : instance of the class that `table_material` returns
+    finer : int
+        As for `their_map`.
 
     Raises
     ------
@@ -332,16 +378,30 @@ def their_scene(mi: Any, scene: Scene, material: Any, finer: int = FINER) -> Any
 
 
 def integrator(mi: Any) -> Any:
-    """Light that is scattered once.
+    """Return an integrator for light that is scattered once.
 
-    Not their "direct": of several samples it adds up what lamps give instead of averaging it
+    It is not Mitsuba's "direct", which sums the samples of point lights instead of averaging them
     (mitsuba3 issue 1861).
+
+    Parameters
+    ----------
+    mi : module mitsuba
     """
     return mi.load_dict({"type": "path", "max_depth": 2})
 
 
 def their_rays(peer: Peer, theirs: Any, scene: Scene, pixels: Int64, each: int) -> Any:
-    """`each` rays through the centre of every pixel, by its flat index."""
+    """Return `each` rays through the centre of every pixel.
+
+    Parameters
+    ----------
+    peer : Peer
+    theirs : what `their_scene` returns
+    scene : Scene
+    pixels : (m,) int array
+        Flat indices.
+    each : int
+    """
     mi, dr = peer.mi, peer.dr
     y, x = np.divmod(pixels, scene.width)
     at = np.stack([(x + 0.5) / scene.width, (y + 0.5) / scene.height], axis=-1)
@@ -352,7 +412,13 @@ def their_rays(peer: Peer, theirs: Any, scene: Scene, pixels: Int64, each: int) 
 
 
 def rounded(peer: Peer, samples: int) -> int:
-    """The number of samples a pixel that their stratified sampler makes of `samples`."""
+    """Return the samples per pixel that Mitsuba's stratified sampler makes of `samples`.
+
+    Parameters
+    ----------
+    peer : Peer
+    samples : int
+    """
     sampler = peer.mi.load_dict({"type": "multijitter", "sample_count": samples})
     return int(sampler.sample_count())
 
@@ -366,20 +432,25 @@ def traced(
     seed: int,
     sampler: str = "multijitter",
 ) -> Float64:
-    """Mitsuba's radiance (m, 3) of pixels (m,), all samples through their centres.
+    """Return Mitsuba's radiance (m, 3) of pixels, with all samples through their centres.
 
     Parameters
     ----------
-    theirs : what `their_scene` made of `scene`
-    pixels : (m,) flat indices
-    samples : of a pixel, as `rounded` gives them
+    peer : Peer
+    theirs : what `their_scene` returned for `scene`
+    scene : Scene
+    pixels : (m,) int array
+        Flat indices.
+    samples : int
+        Samples per pixel, as `rounded` returns them.
     seed : int
-        Of the random numbers: another for each frame.
-    sampler : the plugin that draws them
+        Seed of the random numbers; use another for each frame.
+    sampler : str
+        Name of Mitsuba's sampler plugin.
     """
-    shots = np.array_split(pixels, math.ceil(len(pixels) * samples / _LAUNCH))
+    shots = np.array_split(pixels, math.ceil(len(pixels) * samples / PATHS_AT_ONCE))
     path = integrator(peer.mi)
-    # a seed is hashed with the place in the launch: launches must not share one
+    # the seed is hashed with the index in a launch, so each launch needs its own
     runs = [
         _launch(peer, theirs, path, scene, some, samples, seed * 65_536 + i, sampler)
         for i, some in enumerate(shots)
@@ -403,6 +474,6 @@ def _launch(
     sampler.seed(seed, len(pixels) * samples)
     ray = their_rays(peer, theirs, scene, pixels, samples)
     spectrum, _, _ = path.sample(theirs, sampler, ray)
-    dr.eval(spectrum)  # all at once: each channel by itself would trace the paths again
+    dr.eval(spectrum)  # evaluated at once: each channel alone would trace the paths again
     sums = [dr.block_sum(channel, samples) for channel in spectrum]
     return np.stack([np.array(s, np.float64) for s in sums], axis=-1) / samples

@@ -1,4 +1,4 @@
-"""Agreement of scores with what people say."""
+"""Agreement of trait scores with people's ratings."""
 
 from __future__ import annotations
 
@@ -29,15 +29,21 @@ RATINGS = MappingProxyType(
         "ceramic": ("ceramic", 0.23), "tint": ("reftint", 0.38),
     }
 )  # fmt: skip
-"""Traits that people have rated: the column of the ratings, and the correlation that stood before,
-to two digits."""
+"""Rated traits: the column of the ratings, and the correlation of earlier definitions of the
+traits, to two digits."""
 
 
-# -- people ---------------------------------------------------------------------------------------
+# -- ratings --------------------------------------------------------------------------------------
 
 
 def rated_materials(data: Path) -> tuple[list[str], Float64, dict[str, Float64]]:
-    """Names, encoded coordinates (n, k) and mean ratings (n,) by column of rated materials."""
+    """Return names, encoded coordinates (n, k) and mean ratings (n,) by column of rated materials.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with ratings/ and merl_slices/.
+    """
     with (data / "ratings" / "serrano2016_merl_half.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     known = measured_sets(data)[0]
@@ -49,12 +55,18 @@ def rated_materials(data: Path) -> tuple[list[str], Float64, dict[str, Float64]]
 
 
 def spearman(a: Float64, b: Float64) -> float:
-    """Rank correlation of (n,) and (n,), ties shared."""
+    """Return the rank correlation of `a` (n,) and `b` (n,); ties share their rank."""
     return float(spearmanr(a, b).statistic)
 
 
 def rated(data: Path) -> Iterator[Record]:
-    """Agreement with people, and how much of it a few labels teach."""
+    """Measure the agreement with people, and how much of it a few labels can teach.
+
+    Parameters
+    ----------
+    data : Path
+        Folder with ratings/ and merl_slices/.
+    """
     names, z, ratings = rated_materials(data)
     space, rng = default_traits(), np.random.default_rng(0)
     scores = space.scores(z)
@@ -65,8 +77,8 @@ def rated(data: Path) -> Iterator[Record]:
         drawn = rng.integers(len(names), size=(1000, len(names)))
         low, high = np.percentile([spearman(mine[i], theirs[i]) for i in drawn], [2.5, 97.5])
         fitted = np.mean([_cross_validated(grades, theirs, rng) for _ in range(10)])
-        how = f"Spearman, {len(names)} encoded MERL slices; the target is what stood before, to "
-        how += f"two digits; 95 % by bootstrap {low:.2f} to {high:.2f}; a fit to half of the "
+        how = f"Spearman, {len(names)} encoded MERL slices; the target is the figure of earlier "
+        how += f"definitions; 95 % by bootstrap {low:.2f} to {high:.2f}; a fit to half of the "
         how += f"ratings reaches {fitted:.2f} on the other half"
         met = round(found, 2) >= before
         yield Record(f"people, {name}", found, "", target=before, met=met, how=how)
@@ -92,7 +104,7 @@ def rated(data: Path) -> Iterator[Record]:
 
 
 def _cross_validated(grades: Float64, ratings: Float64, rng: np.random.Generator) -> float:
-    """Spearman on half of the materials of a ridge fit to the other half."""
+    """Return Spearman's correlation on half of the materials of a ridge fit to the other half."""
     order = rng.permutation(len(ratings))
     fit, test = order[: len(order) // 2], order[len(order) // 2 :]
     centre = grades[fit].mean(axis=0)
@@ -102,7 +114,7 @@ def _cross_validated(grades: Float64, ratings: Float64, rng: np.random.Generator
 
 
 def _drawn_labels(labels: Int64, rng: np.random.Generator) -> Int64:
-    """Twelve materials with both labels among the first two."""
+    """Draw twelve materials; the first two have opposite labels."""
     while True:
         chosen = rng.permutation(len(labels))[:12]
         if labels[chosen[0]] * labels[chosen[1]] < 0:

@@ -1,4 +1,4 @@
-"""The same frames by a plain sum over texels and by Mitsuba 3."""
+"""The same frames by other methods: a plain sum over texels, and Mitsuba 3."""
 
 from __future__ import annotations
 
@@ -36,16 +36,21 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 PEER_MATERIALS = ("blue-plastic", "gold-polished", "red-rubber")
-"""Members of the library whose edits are timed beside Mitsuba's: glossy, sharp, and dull."""
+"""Library members whose edits are compared with Mitsuba's: glossy, sharp and dull."""
 
-_SEEDS = 16  # over so many frames the error of a number of samples is averaged
-_MANY = 16384  # samples a pixel that count as converged
+_SEEDS = 16  # frames over which the error of a number of samples is averaged
+_MANY = 16384  # samples per pixel that count as converged
 
 
 def texel_sum(scene: Scene, index: Int64, brdf: TabulatedBRDF) -> Float64:
-    """Radiance (m, 3) by one look-up for each texel, at its centre: the plain way, no shadows.
+    """Return radiance (m, 3) by one look-up per texel, at its centre, without shadows.
 
-    `index` names fragments of one sample each.
+    Parameters
+    ----------
+    scene : Scene
+    index : (m,) int array
+        Fragments of one sample each.
+    brdf : TabulatedBRDF
     """
     environment = scene.environment
     moment = texel_moments(environment).reshape(-1, 3)
@@ -65,7 +70,21 @@ def texel_sum(scene: Scene, index: Int64, brdf: TabulatedBRDF) -> Float64:
 
 
 def texel_sum_torch(scene: Scene, index: Int64, brdf: TabulatedBRDF) -> Float64:
-    """What `texel_sum` does, in torch and float32; for a table on a folded grid."""
+    """Compute `texel_sum` in torch and float32.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : (m,) int array
+        Fragments of one sample each.
+    brdf : TabulatedBRDF
+        On a folded grid.
+
+    Raises
+    ------
+    ValueError
+        If it is on another grid.
+    """
     grid, environment = brdf.grid, scene.environment
     if grid.layout != "folded":
         raise ValueError(f"brdf: expected a table on a folded grid, got {brdf!r}")
@@ -131,12 +150,29 @@ def plain_sums(
     say: Say,
     sums: Mapping[str, Callable[[Scene, Int64, TabulatedBRDF], Float64]],
 ) -> Iterator[Record]:
-    """Plain sums over texels, by what computes them: a frame's time, scaled from `index` (m,)."""
+    """Time plain sums over texels, and scale the time to a whole frame.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : (m,) int array
+        Fragments of one sample each, which are computed.
+    brdf : TabulatedBRDF
+    map_name : str
+    say : callable
+    sums : mapping of str to callable
+        Implementations such as `texel_sum`, by the name of what runs them.
+
+    Raises
+    ------
+    ArithmeticError
+        If the results of two implementations differ by more than 0.1 %.
+    """
     bare = scene.changed(shadows=False)
     true, _ = reference_values(bare, index, [brdf], 1e-3)
     first: Float64 | None = None
     for label, call in sums.items():
-        # what is set up at a first call does not count
+        # a warm-up call
         call(bare, index[:8], brdf)
         start = time.perf_counter()
         plain = call(bare, index, brdf)
@@ -157,21 +193,27 @@ def plain_sums(
         )  # fmt: skip
 
 
-# -- beside another renderer ----------------------------------------------------------------------
+# -- comparison with another renderer -------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Edited:
-    """Edits of the whole object on our side, the last one to a member of the library."""
+    """Our edits of the whole object; the last one assigns a member of the library."""
 
     seconds: Float64
-    frame: Float32  # (H * W, 3) of the last
+    frame: Float32  # (H * W, 3), the last one
     brdf: TabulatedBRDF
     how: str
 
 
 def peer_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """An edit to its frame beside Mitsuba 3 at its best settings, at equal error, in one run."""
+    """Compare an edit's time to its frame with Mitsuba 3 at its best settings and equal error.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     peer = peers.load()
     size, count, repeats = (64, 40, 6) if quick else (512, 300, 30)
     aims = (0.02,) if quick else (0.05, 0.01)
@@ -179,9 +221,9 @@ def peer_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     start = time.perf_counter()
     training_of(default_library(), 0)
     training = time.perf_counter() - start
-    # compiled code is loaded (or compiled) at its first use
+    # warm up: compiled code is loaded (or compiled) at its first use
     EditSession(Scene(teapot(), EnvironmentMap.sky(rows=32), size=16), cache=False).render()
-    # no ground: theirs would hide the lower half of the map from the object
+    # no ground: Mitsuba's would hide the lower half of the map from the object
     session = EditSession(Scene(teapot(), environment, camera=BENCH_CAMERA, size=size), cache=False)
     scene = session.scene
     start = time.perf_counter()
@@ -285,7 +327,7 @@ def peer_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def _edit_whole(session: EditSession, name: str, repeats: int, rng: np.random.Generator) -> _Edited:
-    """Edits of the whole object near a library member, the last one to itself."""
+    """Time edits of the whole object near a library member; the last one assigns that member."""
     objects = list(session.scene.shape.parts)
     session.assign(objects, name)
     home = session.material(objects[0]).z
@@ -294,7 +336,7 @@ def _edit_whole(session: EditSession, name: str, repeats: int, rng: np.random.Ge
     def nearby() -> Float64:
         return np.asarray(home + 0.05 * rng.normal(size=len(home)) * span / np.sqrt(len(home)))
 
-    # what the basis has to learn first is learnt by now
+    # warm up: the basis may have to learn the material first
     for _ in range(3):
         session.assign(objects, nearby())
         session.render()
@@ -316,7 +358,7 @@ def _edit_whole(session: EditSession, name: str, repeats: int, rng: np.random.Ge
 
 
 class _Rival:
-    """Mitsuba on one table: its frames, timed, and their errors at interior `pixels` (m,)."""
+    """Mitsuba on one table: timed frames, and their errors at interior `pixels` (m,)."""
 
     def __init__(
         self,
@@ -335,8 +377,8 @@ class _Rival:
         self._seeds = itertools.count(1)
 
     def frame(self, samples: int) -> tuple[float, float]:
-        """Seconds from an edit to its frame, and that frame's error."""
-        self._trace(self.pixels[:16], samples)  # the first of so many samples is compiled
+        """Return the seconds from an edit to its frame, and the error of that frame."""
+        self._trace(self.pixels[:16], samples)  # compiles a kernel for this number of samples
         start = time.perf_counter()
         self.material.assign(self.table, *self.lobe)
         image = self._trace(self.covered, samples)
@@ -344,13 +386,13 @@ class _Rival:
         return seconds, self._error(image[np.searchsorted(self.covered, self.pixels)])
 
     def converged(self) -> float:
-        """The error that many samples leave; their noise is still in it."""
+        """Return the error at many samples; it still includes their noise."""
         self.material.assign(self.table, *self.lobe)
         runs = [self._trace(self.pixels, peers.rounded(self.peer, _MANY)) for _ in range(4)]
         return self._error(np.mean(runs, axis=0))
 
     def samples_for(self, aim: float) -> tuple[int, float]:
-        """Samples a pixel by which frames err by `aim` on average, and by how much they do."""
+        """Return the samples per pixel at which the mean error is about `aim`, and that error."""
         self.material.assign(self.table, *self.lobe)
         few, many = 1, 4
         more, less = self._expected(few), self._expected(many)
@@ -371,7 +413,7 @@ class _Rival:
         return min(found, key=lambda pair: abs(pair[1] - aim))
 
     def _expected(self, samples: int) -> float:
-        """The mean error of frames with several seeds."""
+        """Return the mean error of frames with several seeds."""
         samples = peers.rounded(self.peer, samples)
         return float(
             np.mean([self._error(self._trace(self.pixels, samples)) for _ in range(_SEEDS)])

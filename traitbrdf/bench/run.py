@@ -1,4 +1,4 @@
-"""Which benches there are, and running them."""
+"""The list of benches, and running them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from traitbrdf.bench.traits import trait_laws
 from traitbrdf.bench.transport import family_error, shadow_error, transport_error
 
 Bench: TypeAlias = Callable[[Path | None, bool, Say], Iterator[Record]]
-"""Measures on the data of a folder, quickly or not, and says what it does meanwhile."""
+"""A function of the data folder, whether to be quick, and a callback for lines of progress."""
 
 BENCHES: dict[str, Bench] = dict(
     zip(
@@ -40,8 +40,25 @@ def run(
     say: Say,
     benches: Mapping[str, Bench] = MappingProxyType(BENCHES),
 ) -> list[Record]:
-    """Run benches by name (where none is named, all but those `ON_REQUEST`); `say` gets every line
-    as it is known."""
+    """Run benches and return their records.
+
+    Parameters
+    ----------
+    names : list of str
+        Names in `benches`; empty for all but those `ON_REQUEST`.
+    data : Path or None
+        Folder with real maps and measured materials.
+    quick : bool
+        Whether to use small sizes.
+    say : callable
+        Receives each line of output when it is known.
+    benches : mapping of str to Bench
+
+    Raises
+    ------
+    ArithmeticError
+        If a figure is not finite.
+    """
     records = []
     for name in names or [name for name in benches if name not in ON_REQUEST]:
         call = benches[name]

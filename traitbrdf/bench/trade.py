@@ -1,7 +1,7 @@
-"""Speed against accuracy as measurements: ``traitbrdf bench promises`` and ``bench trade``.
+"""Speed against accuracy, measured: ``traitbrdf bench promises`` and ``bench trade``.
 
-Promises (`error=`, `fps=`) are held against the oracle on scenes and materials that nothing was
-tuned on; every knob that trades one for the other is turned alone and with the others.
+The promises `error=` and `fps=` are checked against the oracle, on scenes and materials that no
+rule was tuned on. The trade varies every knob of speed and accuracy, alone and together.
 """
 
 from __future__ import annotations
@@ -45,17 +45,24 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 ERRORS = (0.1, 0.03, 0.01, 0.003)
-"""The errors that are asked for."""
+"""Values of `error=` that are tested."""
 
 KEPT = 0.95
-"""The share of cases in which the error asked for shall be met."""
+"""Target share of cases in which the requested error is met."""
 
 
 # -- scenes ---------------------------------------------------------------------------------------
 
 
-def _sheet(points: Float64, normals: Float64, name: str) -> Mesh:
-    """A grid of points (m, n, 3) as a mesh of one part."""
+def surface_mesh(points: Float64, normals: Float64, name: str) -> Mesh:
+    """Return a grid of points as a mesh of one part; triangles without area are dropped.
+
+    Parameters
+    ----------
+    points, normals : (m, n, 3) arrays
+    name : str
+        Name of the part.
+    """
     m, n, _ = points.shape
     at = np.arange(m * n).reshape(m, n)
     a, b, c, d = at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]
@@ -67,7 +74,13 @@ def _sheet(points: Float64, normals: Float64, name: str) -> Mesh:
 
 
 def knot(along: int = 400, around: int = 40) -> Mesh:
-    """A tube along a trefoil: it shades itself everywhere."""
+    """Return a tube along a trefoil knot, which shades itself everywhere.
+
+    Parameters
+    ----------
+    along, around : int
+        Numbers of quads along the tube and around it.
+    """
     t = np.linspace(0.0, 2.0 * math.pi, along + 1)
     r = 2.0 + np.cos(3.0 * t)
     line = np.stack([r * np.cos(2.0 * t), np.sin(3.0 * t), r * np.sin(2.0 * t)], axis=-1)
@@ -79,22 +92,28 @@ def knot(along: int = 400, around: int = 40) -> Mesh:
     up = np.cross(side, tangent)
     a = np.linspace(0.0, 2.0 * math.pi, around + 1)[None, :, None]
     normals = np.cos(a) * side[:, None] - np.sin(a) * up[:, None]
-    return _sheet(line[:, None] + 0.55 * normals, normals, "knot")
+    return surface_mesh(line[:, None] + 0.55 * normals, normals, "knot")
 
 
 def vase(along: int = 120, around: int = 120) -> Mesh:
-    """A body of revolution with a narrow neck: long highlights, shade below the lip."""
+    """Return a body of revolution with a narrow neck: long highlights, and shade below the lip.
+
+    Parameters
+    ----------
+    along, around : int
+        Numbers of quads along the axis and around it.
+    """
     t = np.linspace(0.0, 1.0, along + 1)[:, None]
     height, radius = 3.0 * t, 0.55 + 0.4 * np.sin(2.0 * math.pi * (t + 0.03)) + 0.15 * t**8
     rise, grow = np.gradient(height, axis=0), np.gradient(radius, axis=0)
     a = np.linspace(0.0, 2.0 * math.pi, around + 1)[None]
     points = np.stack([radius * np.sin(a), height + 0.0 * a, radius * np.cos(a)], axis=-1)
     normals = np.stack([rise * np.sin(a), -grow + 0.0 * a, rise * np.cos(a)], axis=-1)
-    return _sheet(points, normals / np.linalg.norm(normals, axis=-1, keepdims=True), "vase")
+    return surface_mesh(points, normals / np.linalg.norm(normals, axis=-1, keepdims=True), "vase")
 
 
 class _Stage(NamedTuple):
-    """A shape under a map; `tuned` says whether rules were tuned on them."""
+    """A shape under a map; `tuned` says whether rules were tuned on it."""
 
     name: str
     shape: Shape
@@ -103,11 +122,12 @@ class _Stage(NamedTuple):
     tuned: bool
 
     def scene(self, size: int | tuple[int, int]) -> Scene:
+        """Return the scene at a size in pixels."""
         return Scene(self.shape, self.environment, camera=self.camera, size=size)
 
 
 def _stages(data: Path | None, quick: bool) -> list[_Stage]:
-    """Every shape under maps of its own: the first half are those that rules were tuned on."""
+    """Return every shape under maps of its own; rules were tuned on the first half only."""
     found = dict(maps(data, False))
     names = list(found)
     plan = [("teapot", 0), ("teapot", 3), ("sphere", 2), ("sphere", 4),
@@ -127,27 +147,27 @@ def _stages(data: Path | None, quick: bool) -> list[_Stage]:
 
 
 def _materials(data: Path | None, quick: bool, each: int) -> list[TabulatedBRDF]:
-    """Tables that neither a session's bases nor its promises were fitted to, of all kinds."""
+    """Return tables of all kinds that neither the bases nor the promises were fitted to."""
     kinds = unseen(data, quick)
-    kinds.pop("held-out library")  # sessions train on members of the whole library
+    kinds.pop("held-out library")  # sessions train on the whole library
     rng = np.random.default_rng(7)
     some = []
     for kind, tables in kinds.items():
-        # of closed forms those that reflect no more than they get: users paint with no others
+        # of the models only those that conserve energy, as users' materials do
         fit = [t for t in tables if kind != "models" or t.max_albedo() <= 1.02]
         some += [fit[i] for i in np.sort(rng.permutation(len(fit))[:each])]
     return some
 
 
 class _Checked(NamedTuple):
-    """Pixels of a scene, and what the oracle says of them for each table."""
+    """Pixels of a scene, and their reference values for each table."""
 
     pixels: Int64
     true: Float64  # (pixels, tables, 3), without the backdrop
 
 
 def _checked(oracle: Oracle, scene: Scene, count: int, seed: int) -> _Checked:
-    """Random covered pixels; those that the oracle refuses are left out."""
+    """Draw random covered pixels, without those at which the reference fails."""
     rng = np.random.default_rng(seed)
     pixels = np.sort(rng.permutation(np.unique(scene.pixels))[:count])
     index = np.flatnonzero(np.isin(scene.pixels, pixels))
@@ -159,14 +179,14 @@ def _checked(oracle: Oracle, scene: Scene, count: int, seed: int) -> _Checked:
 
 
 def _shown(session: EditSession, pixels: Int64) -> Float64:
-    """(n, 3) of the session's frame, without the backdrop."""
+    """Return the session's frame at pixels, (n, 3), without the backdrop."""
     scene = session.scene
     behind = scene.backdrop().reshape(-1, 3)[pixels] * scene.uncovered[pixels, None]
     return np.asarray(session.render().reshape(-1, 3)[pixels] - behind, np.float64)
 
 
 def _edit_times(session: EditSession, count: int, seed: int = 3) -> list[float]:
-    """Seconds from an edit of the whole object to its frame, basis or not."""
+    """Return seconds from edits of the whole object to their frames, from the basis or exact."""
     library = default_library()
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(library), count + 2, replace=False)
@@ -183,7 +203,13 @@ def _edit_times(session: EditSession, count: int, seed: int = 3) -> list[float]:
 
 
 def promises_kept(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Whether `error=` and `fps=` keep their promise, on scenes and materials never tuned on."""
+    """Check `error=` and `fps=` on scenes and materials that no rule was tuned on.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, each, count = (24, 2, 24) if quick else (96, 3, 30)
     tables = _materials(data, quick, each)
     asked = ERRORS[:2] if quick else ERRORS
@@ -249,7 +275,7 @@ def promises_kept(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 def _speeds(
     data: Path | None, quick: bool, say: Say, tables: Sequence[TabulatedBRDF]
 ) -> Iterator[Record]:
-    """`fps=` at two sizes: what is reached, and the error that it costs."""
+    """Measure `fps=` at two sizes: the speed reached, and its error."""
     _, environment = maps(data, True)[0]
     sizes: list[tuple[tuple[int, int], Camera]] = [
         ((512, 512), BENCH_CAMERA),
@@ -268,9 +294,9 @@ def _speeds(
             session = EditSession(scene, fps=fps, cache=False)
             if whole is None:
                 session.prepare()
-                whole = session._view.prepared
-            else:  # of the same preparation another part is used
-                session._view.prepared = promised(whole, session.library, session.settings)
+                whole = session.view.prepared
+            else:  # another part of the same preparation
+                session.view.prepared = promised(whole, session.library, session.settings)
             promise = session.report()["promise"]
             times = _edit_times(session, 6 if quick else 60)
             found = []
@@ -294,7 +320,7 @@ def _speeds(
 def _inside(
     oracle: Oracle, scene: Scene, among: slice, count: int, seed: int
 ) -> tuple[_Checked, Int64]:
-    """Pixels that show one fragment alone, of those `among`; and which these are."""
+    """Draw pixels that show one fragment alone, of those `among`; also return the fragments."""
     index = np.flatnonzero(~scene.bordering[among])
     index = np.sort(np.random.default_rng(seed).permutation(index)[:count])
     values, _ = oracle(scene, index)
@@ -305,25 +331,42 @@ def _inside(
 # -- the trade ------------------------------------------------------------------------------------
 
 
-class _Point(NamedTuple):
-    """One setting of the knobs together: what a frame takes, and what it errs by."""
+class TradePoint(NamedTuple):
+    """One combination of knobs: the cost of a frame, and its error.
+
+    Parameters
+    ----------
+    images : int
+        Basis images.
+    dtype : str
+        Number type of the basis.
+    resolution : float
+        Resolution of the light's nodes, relative to the default.
+    milliseconds, megabytes : float
+        Time and memory of a frame.
+    error, error_95 : float
+        Median and 95th percentile of the frame error over unseen materials and scenes.
+    prepared : float
+        Seconds of preparation.
+    """
 
     images: int
     dtype: str
     resolution: float
     milliseconds: float
     megabytes: float
-    error: float  # median over unseen materials and scenes
+    error: float
     error_95: float
-    prepared: float  # seconds
+    prepared: float
 
     @property
     def label(self) -> str:
+        """The combination in words."""
         return f"{self.images} images, {self.dtype}, resolution {self.resolution:g}"
 
 
 class _Measured(NamedTuple):
-    """A scene of the sweep, its oracle, and its operator compressed at one resolution."""
+    """A scene, its reference values, and its transport at each resolution."""
 
     scene: Scene
     checked: _Checked
@@ -336,7 +379,7 @@ class _Measured(NamedTuple):
 
 
 def _frame(transport: Transport, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A frame of one table (cells seen, 3) on all parts."""
+    """Return a frame of one table (cells seen, 3) on all parts."""
     table = torch.from_numpy(values).to(transport.device)
     parts = [transport.shade(i, table) for i in range(len(transport.scene.parts))]
     return transport.compose(parts).cpu().numpy()
@@ -345,7 +388,7 @@ def _frame(transport: Transport, values: NDArray[np.float32]) -> NDArray[np.floa
 def _frame_errors(
     transport: Transport, checked: _Checked, tables: Sequence[TabulatedBRDF]
 ) -> list[float]:
-    """Mean relative L1 of each table's frame at the checked pixels."""
+    """Return the mean relative L1 of each table's frame at the checked pixels."""
     scene = transport.scene
     behind = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
     found = []
@@ -357,7 +400,7 @@ def _frame_errors(
 
 
 def _frame_milliseconds(transport: Transport, repeats: int) -> float:
-    """From coordinates to a frame: the median."""
+    """Return the median time from coordinates to a frame."""
     library = default_library()
     turn = itertools.cycle(library.coordinates[:: len(library) // 16])
     return milliseconds(
@@ -375,12 +418,15 @@ def _operator_errors(
     tables: Sequence[TabulatedBRDF],
     **settings: Any,
 ) -> tuple[float, float, float]:
-    """Errors (median, 95th percentile) of the uncompressed operator at fragments, and the
-    milliseconds that a fragment takes it, rays included."""
+    """Return the error of the uncompressed operator at fragments, and its time.
+
+    The three numbers are the median and 95th percentile of the errors, and milliseconds per
+    fragment, rays included.
+    """
     grid = default_library().embedding.grid_
     columns = channels(tables)
     operator = Operator(scene, grid, **settings)
-    operator.images(index[:2], columns)  # what is compiled or loaded once is not counted
+    operator.images(index[:2], columns)  # a warm-up call: compiled code is loaded once
     start = time.perf_counter()
     shown = own_colours(operator.images(index, columns))
     seconds = time.perf_counter() - start
@@ -389,13 +435,26 @@ def _operator_errors(
 
 
 def _spread(errors: Sequence[float]) -> tuple[float, float]:
-    """Median and 95th percentile."""
+    """Return median and 95th percentile."""
     return float(np.median(errors)), float(np.quantile(errors, 0.95))
 
 
 def coarser(environment: EnvironmentMap, factor: int) -> EnvironmentMap:
-    """A map of `factor` times fewer rows and columns, each texel the mean of those it covers by
-    their solid angles: the same light from wider pieces."""
+    """Return a map of fewer texels, each the mean of those it covers, weighted by solid angle.
+
+    So the light stays the same, from wider texels.
+
+    Parameters
+    ----------
+    environment : EnvironmentMap
+    factor : int
+        Divisor of the numbers of rows and columns.
+
+    Raises
+    ------
+    ValueError
+        On another factor.
+    """
     rows, columns, _ = environment.image.shape
     if factor < 1 or rows % factor or columns % factor:
         raise ValueError(f"factor: expected a divisor of {rows} and {columns}, got {factor!r}")
@@ -407,8 +466,15 @@ def coarser(environment: EnvironmentMap, factor: int) -> EnvironmentMap:
 
 
 def bandwidth(seconds: float = 0.5) -> float:
-    """Bytes a second that this machine reads of memory, all threads of torch: the best of some
-    sums over what no cache holds."""
+    """Measure the memory bandwidth of this machine in bytes per second, with all threads of torch.
+
+    It is the best of several sums over an array that exceeds all caches.
+
+    Parameters
+    ----------
+    seconds : float
+        Duration of the measurement.
+    """
     values = torch.ones(1 << 26)
     best, end = 0.0, time.perf_counter() + seconds
     while time.perf_counter() < end:
@@ -418,10 +484,15 @@ def bandwidth(seconds: float = 0.5) -> float:
     return best
 
 
-def pareto(points: Sequence[_Point]) -> list[_Point]:
-    """Those that no other beats in time, memory and error at once, the fastest first."""
+def pareto(points: Sequence[TradePoint]) -> list[TradePoint]:
+    """Return the Pareto front in time, memory and error, the fastest point first.
 
-    def beaten(p: _Point) -> bool:
+    Parameters
+    ----------
+    points : sequence of TradePoint
+    """
+
+    def beaten(p: TradePoint) -> bool:
         mine = (p.milliseconds, p.megabytes, p.error)
         for q in points:
             other = (q.milliseconds, q.megabytes, q.error)
@@ -432,18 +503,25 @@ def pareto(points: Sequence[_Point]) -> list[_Point]:
     return sorted((p for p in points if not beaten(p)), key=lambda p: p.milliseconds)
 
 
-def _outline(points: Sequence[_Point]) -> list[_Point]:
-    """Those that no faster one equals in error, memory aside."""
-    found: list[_Point] = []
+def _outline(points: Sequence[TradePoint]) -> list[TradePoint]:
+    """Return the Pareto front in time and error alone, the fastest point first."""
+    found: list[TradePoint] = []
     for p in sorted(points, key=lambda p: (p.milliseconds, p.error)):
         if not found or p.error < found[-1].error:
             found.append(p)
     return found
 
 
-def knee(points: Sequence[_Point]) -> _Point:
-    """Where more time stops paying: of time and error, both as logarithms, the point furthest below
-    the line from the fastest to the most exact."""
+def knee(points: Sequence[TradePoint]) -> TradePoint:
+    """Return the knee of the Pareto front in time and error: beyond it, more time gains little.
+
+    With both as logarithms, it is the point furthest below the line from the fastest to the most
+    accurate point.
+
+    Parameters
+    ----------
+    points : sequence of TradePoint
+    """
     front = _outline(points)
     x = np.log([p.milliseconds for p in front])
     y = np.log([max(p.error, 1e-6) for p in front])
@@ -453,7 +531,15 @@ def knee(points: Sequence[_Point]) -> _Point:
 
 
 def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> Iterator[Record]:
-    """Every knob of speed against accuracy, alone and together, on real maps."""
+    """Measure every knob of speed against accuracy, alone and together, on real maps.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    out : Path or None
+        Folder for trade.json and trade.png.
+    """
     size, each, count, repeats = (24, 2, 24, 3) if quick else (256, 5, 48, 15)
     ranks = (8, 24, 40) if quick else LADDER
     resolutions = (0.7, 1.0) if quick else (0.5, 1.0, 2.0)
@@ -487,7 +573,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
             f"95th {100 * high:6.3f} %"
         )
 
-    say("  -- alone; a frame, or a fragment of the operator where preparation is what it changes")
+    say("  -- alone; time of a frame, or of a fragment for knobs that change the preparation")
     points = []
     for resolution in resolutions:
         for rank in ranks:
@@ -504,7 +590,9 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
                 ms, mb = float(np.mean(times)), float(np.mean(sizes))
                 kind = str(dtype).removeprefix("torch.")
                 points.append(
-                    _Point(rank, kind, resolution, ms, mb, *_spread(errors), float(np.mean(spent)))
+                    TradePoint(
+                        rank, kind, resolution, ms, mb, *_spread(errors), float(np.mean(spent))
+                    )
                 )
                 usual = QUALITIES["interactive"]
                 if resolution == usual[1] and dtype == torch.float32:
@@ -551,7 +639,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         for one in scenes:
             errors += _frame_errors(one.usual, one.checked, fewer)
         knob("embedding", f"{int(kept.sum())} numbers", None, math.nan, errors)
-    say("  -- together: what nothing else beats in time, memory and error at once")
+    say("  -- together: the Pareto front in time, memory and error")
     front = pareto(points)
     best = knee(front)
     rate = bandwidth()
@@ -566,7 +654,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         )
     if out is not None:
         _write(out, points, front, best, settings, rate)
-        say(f"  {out / 'trade.json'} and {out / 'trade.png'} hold all of it")
+        say(f"  wrote all of it to {out / 'trade.json'} and {out / 'trade.png'}")
     how = (
         f"{len(scenes)} scenes of {size}x{size}, {len(tables)} unseen BRDFs, {len(points)} "
         f"settings of images, number type and resolution, {torch.get_num_threads()} threads; "
@@ -578,7 +666,7 @@ def trade(data: Path | None, quick: bool, say: Say, out: Path | None = None) -> 
         f"{100 * best.error_95:.2f} %",
     )  # fmt: skip
     yield Record(
-        "the same if memory were all", 1e3 * moved / rate, "ms", error=best.error,
+        "the same, by memory bandwidth alone", 1e3 * moved / rate, "ms", error=best.error,
         how=f"{moved / 1e6:.0f} MB over {rate / 1e9:.1f} GB/s, measured",
     )  # fmt: skip
     for point, name in ((front[0], "fastest"), (min(points, key=lambda p: p.error), "most exact")):
@@ -604,21 +692,21 @@ def _say_setting(setting: tuple[str, str, float | None, float, float], say: Say,
     )
 
 
-def _bytes_moved(scenes: Sequence[_Measured], point: _Point) -> float:
-    """What a frame has to read and write at the least: basis, projection, radiance and image."""
+def _bytes_moved(scenes: Sequence[_Measured], point: TradePoint) -> float:
+    """Return the bytes that a frame must read and write: basis, projection, radiance and image."""
     shown = [12 * (2 * len(s.scene.pixels) + len(s.scene.uncovered)) for s in scenes]
     return 1e6 * point.megabytes + float(np.mean(shown))
 
 
 def _write(
     out: Path,
-    points: Sequence[_Point],
-    front: Sequence[_Point],
-    best: _Point,
+    points: Sequence[TradePoint],
+    front: Sequence[TradePoint],
+    best: TradePoint,
     settings: Sequence[tuple[str, str, float | None, float, float]],
     rate: float,
 ) -> None:
-    """``trade.json`` and, where matplotlib is installed, ``trade.png``."""
+    """Write ``trade.json`` and ``trade.png``."""
     out.mkdir(parents=True, exist_ok=True)
     found = {
         "together": [{**p._asdict(), "pareto": p in front, "knee": p is best} for p in points],
@@ -636,12 +724,12 @@ def _write(
 
 def _plot(
     path: Path,
-    points: Sequence[_Point],
-    front: Sequence[_Point],
-    best: _Point,
+    points: Sequence[TradePoint],
+    front: Sequence[TradePoint],
+    best: TradePoint,
     settings: Sequence[tuple[str, str, float | None, float, float]],
 ) -> None:
-    """Error over time of all settings, and what each knob alone costs and brings."""
+    """Plot error over time of all settings, and the cost and effect of each knob alone."""
     try:
         figure = importlib.import_module("matplotlib.figure")
         ticker = importlib.import_module("matplotlib.ticker")
@@ -662,7 +750,7 @@ def _plot(
         textcoords="axes fraction", arrowprops={"arrowstyle": "->"}, fontsize=8,
     )  # fmt: skip
     left.set(xscale="log", yscale="log", xlabel="edit to frame, ms", ylabel="frame error, %")
-    left.set_title("all settings; the line is what nothing beats", fontsize=10)
+    left.set_title("all settings; the line is the Pareto front", fontsize=10)
     left.legend(fontsize=8)
     names = list(dict.fromkeys(s[0] for s in settings))
     for name in names:

@@ -1,9 +1,9 @@
-"""What moves of traits do, measured: ``traitbrdf bench traits``.
+"""Measured properties of trait moves: ``traitbrdf bench traits``.
 
-Laws that a designer relies on: a move never leaps, two moves in a row are one, a move back undoes
-it, colours and lightness stay where they are held, what is asked for is reached. All is read off
-decoded tables by operators over all their cells, so that errors of the few cells that the moves
-themselves read are part of what is measured.
+A designer relies on these laws: a move never jumps; two moves in a row equal their sum; a move back
+undoes a move; colours and lightness stay where they are held; and a move reaches the amount asked
+for. All of them are measured on decoded tables, over all cells. So the errors of the few cells that
+moves themselves use are included.
 """
 
 from __future__ import annotations
@@ -34,36 +34,37 @@ from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.reflectance.descriptors import READINGS, cielab, describe_columns, hue, reading_rows
 from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.holding import COLOURS, LIGHT
 from traitbrdf.space.library import default_library
-from traitbrdf.space.traits import COLOURS, LIGHT, RELATED, Method, TraitSpace, default_traits
+from traitbrdf.space.traits import RELATED, Method, TraitSpace, default_traits
 
 Int64 = NDArray[np.int64]
 Float64 = NDArray[np.float64]
 
 STARTS = ("oak-varnished", "red-rubber", "blue-plastic", "gold-polished", "satin-olive-leather-47")
-"""Members from which all traits are moved, beside random ones: wood, rubber, plastic, metal,
-leather."""
+"""Members from which all traits are moved, in addition to random ones: wood, rubber, plastic,
+metal, leather."""
 
 AMOUNTS = np.linspace(-1.0, 1.0, 41)
 """Amounts of a sweep."""
 
 JUMP = 8.0
-"""A step of a sweep is no jump if its colour difference is less: CIE 1976, as everywhere here."""
+"""Least colour difference of a jump, CIE 1976 (as are all colour differences here)."""
 
 TURN = 5.0
-"""Degrees by which a hue that is held may turn."""
+"""Degrees by which a held hue may turn."""
 
 HAS_HUE = (8.0, 6.0)
-"""Chroma from which a colour has a hue that can turn, before and after a move."""
+"""Least chroma, before and after a move, at which the hue of a colour counts."""
 
 LIGHTER = 5.0
-"""L* by which a lightness that is held may change."""
+"""L* by which a held lightness may change."""
 
 FALL = 1e-3
-"""What a score may fall by where it shall rise."""
+"""Amount by which a score may fall while the move raises it."""
 
 REACHED = 0.9
-"""The share of an amount from which a move counts as whole."""
+"""Least share of the requested amount at which a move counts as complete."""
 
 PICTURE = 32
 """Pixels of the side of a rendered sphere."""
@@ -74,32 +75,47 @@ _SEEN = [READINGS.index(name) for name in _SURFACES]
 _HUES = [_AT_30, _AT_60, _BODY]
 
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""`map`, or that of a pool of processes."""
+"""`map`, or the `map` of a pool of processes."""
 
 
-# -- what is seen ---------------------------------------------------------------------------------
+# -- visible properties ---------------------------------------------------------------------------
 
 
 def read_tables(z: Float64) -> Float64:
-    """`descriptors.READINGS` (n, readings, 3) of the decoded tables of coordinates (n, k)."""
+    """Return the readings (n, readings, 3) of the decoded tables of coordinates `z` (n, k).
+
+    They are those of `traitbrdf.reflectance.descriptors.READINGS`.
+    """
     embedding = default_library().embedding
     rows = reading_rows(embedding.grid_)
-    # a move that has ended stays where it is: no need to decode that again
+    # points repeat once a move has stopped: decode each only once
     points, where = np.unique(z, axis=0, return_inverse=True)
     found = [rows @ embedding.decode_values(point).astype(np.float64) for point in points]
     return np.array(found)[where.reshape(-1)]
 
 
 def colours(readings: Float64) -> Float64:
-    """CIELAB (..., 4, 3) of `READINGS` (..., readings, 3): of all reflected light at 10, 30 and 60
-    degrees, and of the body (pi f, as a white body would have 1)."""
+    """Return CIELAB (..., 4, 3) of `readings` (..., readings, 3).
+
+    The four colours are all reflected light at 10, 30 and 60 degrees, and the body (pi f, so that a
+    white body has 1).
+    """
     rgb = readings[..., _SEEN, :].copy()
     rgb[..., _BODY, :] *= math.pi
     return cielab(rgb)
 
 
 def scores_read(space: TraitSpace, z: Float64, readings: Float64) -> Float64:
-    """Scores (..., t) of what tables (..., readings, 3) show; z (..., k) is for straight traits."""
+    """Return the scores (..., t) of tables.
+
+    Parameters
+    ----------
+    space : TraitSpace
+    z : (..., k) array
+        Coordinates, which only linear traits use.
+    readings : (..., readings, 3) array
+        Of the tables.
+    """
     raw = z @ space.normals.T
     if space.optics is not None:
         raw = raw + space.optics.grades.of(describe_columns(readings)) @ space.weights.T
@@ -108,13 +124,13 @@ def scores_read(space: TraitSpace, z: Float64, readings: Float64) -> Float64:
 
 
 def difference(before: Float64, after: Float64) -> Float64:
-    """Greatest CIE 1976 colour difference (...) of any surface of `colours` (..., 4, 3)."""
+    """Return the greatest colour difference (...) from `before` to `after`, CIELAB (..., 4, 3)."""
     found: Float64 = np.linalg.norm(after - before, axis=-1).max(axis=-1)
     return found
 
 
 def starting(count: int, seed: int = 0) -> list[str]:
-    """So many members: first `STARTS`, then random others."""
+    """Return the names of `count` members: first `STARTS`, then random others, drawn by `seed`."""
     library, rng = default_library(), np.random.default_rng(seed)
     others = [name for name in library.names if name not in STARTS]
     more = rng.permutation(len(others))[: max(count - len(STARTS), 0)]
@@ -122,7 +138,7 @@ def starting(count: int, seed: int = 0) -> list[str]:
 
 
 def _point(name: str) -> Float64:
-    """Coordinates (k,) of a member, in the box: what its moves set out from."""
+    """Return the coordinates (k,) of a member, clipped to the box: the start of its moves."""
     library = default_library()
     return library.embedding.clip(library.coordinates[library.index(name)])
 
@@ -131,15 +147,17 @@ def _point(name: str) -> Float64:
 
 
 class Sweep(NamedTuple):
-    """A trait moved through `AMOUNTS` from one member, and what is seen of it.
+    """A trait moved through `AMOUNTS` from one member, and its visible effects.
 
     Attributes
     ----------
-    start, trait : names
-    z : (41, k) coordinates
-    lab : (41, 4, 3) `colours`
-    score, own : (41,) of the trait: as tables show it, and as the few cells have it that moves
-        themselves read
+    start, trait : str
+    z : (41, k) array
+        Coordinates.
+    lab : (41, 4, 3) array
+        `colours`.
+    score, own : (41,) arrays
+        Score of the trait, read off whole tables, and off the few cells that moves use.
     """
 
     start: str
@@ -151,25 +169,34 @@ class Sweep(NamedTuple):
 
     @property
     def steps(self) -> Float64:
-        """Colour difference (40,) of neighbours."""
+        """Colour differences (40,) of neighbours."""
         return difference(self.lab[:-1], self.lab[1:])
 
     @property
     def fall(self) -> float:
-        """The most by which the score falls in a step, 0 if it never does."""
+        """The largest fall of the score in one step; 0 if it never falls."""
         return max(0.0, -float(np.diff(self.score).min()))
 
     @property
     def own_fall(self) -> float:
-        """The same of the moves' own score."""
+        """The largest fall in one step of the score that moves use."""
         return max(0.0, -float(np.diff(self.own).min()))
 
 
 def sweep(
     start: str, trait: str, method: Method = "flow", space: TraitSpace | None = None
 ) -> Sweep:
-    """A trait moved from a member of the library by all of `AMOUNTS`; what holds by default is
-    held, by straight vectors nothing."""
+    """Move a trait from a member of the library by all of `AMOUNTS`.
+
+    Flows hold what they hold by default; linear moves hold nothing.
+
+    Parameters
+    ----------
+    start, trait : str
+    method : "flow" or "linear"
+    space : TraitSpace or None
+        None is the default space.
+    """
     space = default_traits() if space is None else space
     z = _point(start)
     if method == "linear":
@@ -189,15 +216,20 @@ def sweep(
 
 
 def sweeps(start: str, traits: Sequence[str], method: Method = "flow") -> list[Sweep]:
-    """`sweep` of each trait from one member."""
+    """Return the `sweep` of each of `traits` from the member `start`, by `method`."""
     return [sweep(start, trait, method) for trait in traits]
 
 
 def jumps(steps: Float64) -> NDArray[np.bool_]:
-    """Where (n,) steps (n,) of a sweep, in colour differences, are jumps.
+    """Return which steps of a sweep are jumps, as booleans (n,).
 
-    More than `JUMP`, five times the sweep's median, and twice either neighbour: a change that is
-    merely fast goes on for some steps, a jump is made at once.
+    A jump is larger than `JUMP`, five times the sweep's median, and twice either neighbour. A fast
+    but continuous change takes several steps; a jump takes one.
+
+    Parameters
+    ----------
+    steps : (n,) array
+        Colour differences.
     """
     around = np.concatenate([[0.0], steps, [0.0]])
     beside = np.maximum(around[:-2], around[2:])
@@ -206,9 +238,18 @@ def jumps(steps: Float64) -> NDArray[np.bool_]:
 
 
 def rendered_steps(points: Float64, environment: EnvironmentMap, size: int = PICTURE) -> Float64:
-    """Mean colour difference (n - 1,) of pictures of neighbours among coordinates (n, k).
+    """Return the mean colour difference (n - 1,) of rendered pictures of neighbours.
 
-    A sphere of each, exposed alike and tone-mapped; over its pixels alone.
+    The pictures show spheres with one exposure, tone-mapped; the mean is over the pixels of the
+    sphere.
+
+    Parameters
+    ----------
+    points : (n, k) array
+        Coordinates.
+    environment : EnvironmentMap
+    size : int
+        Pixels on a side.
     """
     embedding = default_library().embedding
     unique, where = np.unique(points, axis=0, return_inverse=True)
@@ -224,12 +265,12 @@ def rendered_steps(points: Float64, environment: EnvironmentMap, size: int = PIC
 _BYTES = np.arange(256) / 255.0
 
 _LINEAR = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
-"""Linear light (256,) of a byte: IEC 61966-2-1."""
+"""Linear values (256,) of sRGB bytes: IEC 61966-2-1."""
 
 
 @functools.lru_cache(maxsize=2)
 def _map(path: Path | None) -> EnvironmentMap:
-    # the very same object each time: what spheres need of it is kept by that
+    # the same object each time, because `pictures.spheres` caches by its identity
     return EnvironmentMap.sky() if path is None else EnvironmentMap.read(path)
 
 
@@ -242,13 +283,16 @@ def _rendered(job: tuple[Path | None, Float64]) -> Float64:
 
 
 class Composed(NamedTuple):
-    """Colour differences of what should be alike, where no move stopped or met a wall.
+    """Colour differences of moves that should agree, without those that stopped or met a wall.
 
     Attributes
     ----------
-    added : (m,) of a move by a and then by b, and one by a + b
-    undone : (n,) of a start, and a move by a and then by -a
-    tried : how many of each were tried
+    added : (m,) array
+        Between a move by a and then by b, and one by a + b.
+    undone : (n,) array
+        Between a start, and a move by a and then by -a.
+    tried : int
+        How many of each were tried.
     """
 
     added: Float64
@@ -257,7 +301,7 @@ class Composed(NamedTuple):
 
 
 def composed(seed: int, count: int) -> Composed:
-    """Random moves of random members, a and b from .1 to .5 with one sign, done in a row."""
+    """Make `count` pairs of random moves a and b, from .1 to .5, of one sign, by `seed`."""
     library, space, rng = default_library(), default_traits(), np.random.default_rng(seed)
     added: list[float] = []
     undone: list[float] = []
@@ -282,17 +326,23 @@ def composed(seed: int, count: int) -> Composed:
 
 
 class Made(NamedTuple):
-    """Moves of one trait each, and what they changed.
+    """Moves of one trait each, and the changes they made.
 
     Attributes
     ----------
-    trait : (m,) its place in `TraitSpace.names`
-    amount : (m,)
-    z : (m, 2, k) coordinates before and after
-    lab : (m, 2, 4, 3) `colours` before and after
-    scores : (m, 2, t) before and after, as tables show them
-    held : (m, h) places of the traits that were held
-    stopped : m reasons, "" where all was reached
+    trait : (m,) array
+        Index in `TraitSpace.names`.
+    amount : (m,) array
+    z : (m, 2, k) array
+        Coordinates before and after.
+    lab : (m, 2, 4, 3) array
+        `colours` before and after.
+    scores : (m, 2, t) array
+        Scores before and after, read off whole tables.
+    held : (m, h) array
+        Indices of the traits that were held.
+    stopped : tuple of m str
+        The reason why a move stopped; "" if it reached its amount.
     """
 
     trait: Int64
@@ -305,17 +355,17 @@ class Made(NamedTuple):
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """(m,) whether all was reached, as the move itself says."""
+        """Whether each move reached its amount (m,), by its own report."""
         return np.array([not why for why in self.stopped], bool)
 
     @property
     def share(self) -> Float64:
-        """(m,) how much of the amount was made, by the scores of `TraitSpace`."""
+        """Share (m,) of the amount that was reached, by the scores of `TraitSpace`."""
         return self._share(default_traits().scores(self.z))
 
     @property
     def shown(self) -> Float64:
-        """(m,) the same as tables show it."""
+        """Share (m,) of the amount that was reached, by scores read off whole tables."""
         return self._share(self.scores)
 
     def _share(self, scores: Float64) -> Float64:
@@ -325,8 +375,10 @@ class Made(NamedTuple):
 
     @property
     def turned(self) -> Float64:
-        """(m,) the most degrees by which a hue turned: of all light at 30 and 60 degrees and of the
-        body, each where it has one (`HAS_HUE`). NaN where none has."""
+        """The most degrees (m,) by which a hue turned; NaN if no colour has a hue.
+
+        Counts all light at 30 and 60 degrees and the body, each if its chroma exceeds `HAS_HUE`.
+        """
         (was, before), (now, after) = (
             np.moveaxis(hue(self.lab[:, i][:, _HUES]), -1, 0) for i in range(2)
         )
@@ -337,12 +389,12 @@ class Made(NamedTuple):
 
     @property
     def lighter(self) -> Float64:
-        """(m,) change of L* of all light at 30 degrees."""
+        """Change (m,) of L* of all light at 30 degrees."""
         found: Float64 = self.lab[:, 1, _AT_30, 0] - self.lab[:, 0, _AT_30, 0]
         return found
 
     def among(self, names: Iterable[str]) -> Made:
-        """Those of some traits."""
+        """Return the moves of the traits `names`."""
         space = default_traits()
         kept = np.isin(self.trait, [space.index(name) for name in names])
         return Made(
@@ -364,15 +416,21 @@ def made(
     within: bool = False,
     held: int = 0,
 ) -> Made:
-    """Each trait moved by each amount from one member.
+    """Move each trait by each amount from one member.
 
     Parameters
     ----------
-    start : a member of the library
-    method : "flow" holds what it holds by default, "linear" nothing
-    within : whether to leave out what would go beyond what the library has (`TraitSpace.limits`)
-    held : so many random traits that are not related with the one that moves are held, and nothing
-        else; 0 holds what is held by default
+    start : str
+        A member of the library.
+    traits : sequence of str
+    amounts : sequence of float
+    method : "flow" or "linear"
+        Flows hold what they hold by default, linear moves nothing.
+    within : bool
+        Whether to leave out moves beyond the library's range (`TraitSpace.limits`).
+    held : int
+        Number of random traits to hold, unrelated to the moved one, and nothing else; 0 is the
+        default of the method.
     """
     library, space = default_library(), default_traits()
     z = _point(start)
@@ -413,7 +471,7 @@ def made(
 
 
 def joined(parts: Iterable[Made]) -> Made:
-    """All of several."""
+    """Join several `Made`, which are `parts`, into one."""
     every = list(parts)
     return Made(
         np.concatenate([part.trait for part in every]),
@@ -427,7 +485,7 @@ def joined(parts: Iterable[Made]) -> Made:
 
 
 def unrelated_change(moves: Made) -> Float64:
-    """Mean |change| (m,) of the scores of traits that are not related with the moved one."""
+    """Return the mean |change| (m,) of scores unrelated to the moved traits of `moves`."""
     space = default_traits()
     apart = np.abs(space.related[moves.trait]) < RELATED
     change = np.abs(moves.scores[:, 1] - moves.scores[:, 0])
@@ -436,8 +494,10 @@ def unrelated_change(moves: Made) -> Float64:
 
 
 def held_change(moves: Made, shown: bool = True) -> Float64:
-    """|change| (m, h) of the scores of held traits: as tables show them, or as the few cells have
-    them that moves themselves read."""
+    """Return the |change| (m, h) in `moves` of the scores of held traits.
+
+    They are read off whole tables if `shown`, else off the few cells that moves use.
+    """
     scores = moves.scores if shown else default_traits().scores(moves.z)
     change = np.abs(scores[:, 1] - scores[:, 0])
     return np.take_along_axis(change, moves.held, axis=1)
@@ -447,7 +507,7 @@ def held_change(moves: Made, shown: bool = True) -> Float64:
 
 
 class Physics(NamedTuple):
-    """Least f in 1/sr, greatest albedo, and deepest hole in a highlight (0 to 1), of tables."""
+    """The `least` f in 1/sr, greatest `albedo`, and deepest `hole` in a highlight (0 to 1)."""
 
     least: float
     albedo: float
@@ -455,7 +515,7 @@ class Physics(NamedTuple):
 
 
 def composites(seed: int, count: int) -> Physics:
-    """Random edits of two traits by up to 3, of random members, with what holds by default."""
+    """Check `count` random edits, by `seed`, of two traits by up to 3, with default holds."""
     library, space, rng = default_library(), default_traits(), np.random.default_rng((2, seed))
     embedding = library.embedding
     rows = albedo_operator(embedding.grid_, ALBEDO_ANGLES)
@@ -475,15 +535,15 @@ def composites(seed: int, count: int) -> Physics:
 
 
 def move_times(count: int, seed: int = 3) -> tuple[Float64, Float64]:
-    """Milliseconds of moves (count,), and of further steps (5 count,) of a drag.
+    """Return milliseconds of `count` moves, and of further steps (5 count,) of a drag, by `seed`.
 
-    Moves of +0.5 that were not made before, with what holds by default; then, as a hand drags a
-    slider on, to .52, .54, ... .6.
+    The moves are of +0.5, not made before, with default holds. Then each goes on to .52, .54, ...
+    .6, as when a slider is dragged.
     """
     library, rng = default_library(), np.random.default_rng(seed)
     space = TraitSpace.from_arrays(
         default_traits().arrays() | {"low": default_traits().low, "high": default_traits().high}
-    )  # which has made none of the moves that are timed
+    )  # a new space, which has cached none of the timed moves
     space.reach(library.coordinates[0], {space.names[0]: 0.1})
     first: list[float] = []
     further: list[float] = []
@@ -512,9 +572,9 @@ print(json.dumps([imported, compiled, first]))
 
 
 def first_move() -> tuple[float, int, float]:
-    """Seconds of the import, files that it compiled, and seconds of the first move.
+    """Return seconds of the import, the number of files it compiled, and seconds of the first move.
 
-    In a process of its own with an empty cache of compiled code.
+    Measured in a new process with an empty cache of compiled code.
     """
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
@@ -529,37 +589,43 @@ def first_move() -> tuple[float, int, float]:
 
 
 class _Size(NamedTuple):
-    """How much is measured."""
+    """Numbers of starts and moves to measure."""
 
-    starts: int  # of sweeps
-    drawn: int  # of those, rendered too
-    composed: int  # moves in a row
-    colours: int  # members of which colours are watched
-    reach: int  # members from which all traits move by half
-    held: int  # of those, with three traits held
+    starts: int  # members from which sweeps start
+    drawn: int  # of these, rendered too
+    composed: int  # pairs of moves in a row
+    colours: int  # members whose colours are checked
+    reach: int  # members from which all traits move by half a unit
+    held: int  # of these, with three traits held
     composites: int
     times: int
-    compared: int  # members for straight vectors
+    compared: int  # members for linear moves
 
 
 _QUICK = _Size(1, 1, 25, 2, 3, 2, 25, 20, 1)
 _WHOLE = _Size(25, 3, 1000, 100, 500, 100, 10_000, 400, 10)
 _DONE = "complete by the few cells that moves read"
-_PART = 25  # moves that a process makes before it asks for more
+_PART = 25  # moves in one job of a process
 
 
 def trait_laws(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Traits: agreement with people, and the laws that moves keep."""
+    """Measure traits: agreement with people, and the laws that moves keep.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size = _QUICK if quick else _WHOLE
     if quick:
-        say("  not quickly: what people say, and how long a first move is compiled")
+        say("  skipped when quick: people's ratings, and the time to compile a first move")
     elif data is not None and (data / "ratings").is_dir():
         yield from rated(data)
     yield from _times(size, quick)
-    if quick:  # over before processes have started
+    if quick:  # faster than starting processes
         yield from _laws(data, size, map, say)
         return
-    # a thread each: processes that share the cores wait for each other's threads most of the time
+    # one thread per process, because threads of several processes would wait for each other
     alone = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     before = {name: os.environ.get(name) for name in alone}
     os.environ.update(alone)
@@ -609,7 +675,7 @@ def _flat(parts: Iterable[list[Sweep]]) -> list[Sweep]:
 def _continuity(
     where: str, steps: Sequence[Float64], swept: Sequence[Sweep], of: str, say: Say
 ) -> Iterator[Record]:
-    """Jumps and the greatest step of sweeps, of which steps (40,) are known."""
+    """Yield jumps and the greatest step of sweeps, given their steps (40,)."""
     count, greatest = 0, 0.0
     for one, step in zip(swept, steps, strict=True):
         jumped = np.flatnonzero(jumps(step))
@@ -634,12 +700,12 @@ def _continuity(
 def _pictures(
     data: Path | None, size: _Size, swept: Sequence[Sweep], each: Each, say: Say
 ) -> Iterator[Record]:
-    """Continuity of rendered spheres."""
+    """Measure the continuity of rendered spheres."""
     files = [data / "envmaps" / f"{name}.exr" for name in ("studio", "forest")] if data else []
     known: list[Path | None] = [file for file in files if file.is_file()]
     starts = list(dict.fromkeys(one.start for one in swept))[: size.drawn]
     drawn = [one for one in swept if one.start in starts]
-    if size is _QUICK:  # every picture takes as long as twenty tables
+    if size is _QUICK:  # a picture takes as long as twenty tables
         drawn = drawn[::5]
     for path in known or [None]:
         name = "sky" if path is None else path.stem
@@ -651,7 +717,7 @@ def _pictures(
 
 
 def _rows(size: _Size, each: Each) -> Iterator[Record]:
-    """Moves in a row."""
+    """Measure moves in a row."""
     parts = [*each(functools.partial(composed, count=_PART), _seeds(size.composed))]
     tried = sum(part.tried for part in parts)
     for what, how, found in (
@@ -666,12 +732,12 @@ def _rows(size: _Size, each: Each) -> Iterator[Record]:
 
 
 def _seeds(count: int) -> range:
-    """A seed for each part of so many moves."""
+    """Return a seed for each job of `count` moves in all."""
     return range(math.ceil(count / _PART))
 
 
 def _colours(size: _Size, plain: Sequence[str], each: Each, say: Say) -> Iterator[Record]:
-    """Hues and lightness where they are held."""
+    """Measure how well hue and lightness are kept where they are held."""
     chosen = starting(size.colours, 4)
     moves = joined(each(functools.partial(made, traits=plain, amounts=(-0.5, 0.5)), chosen))
     held = [name for name in plain if name not in LIGHT]
@@ -708,7 +774,7 @@ def _percent(share: float) -> str:
 
 
 def _reach(size: _Size, each: Each, say: Say) -> Iterator[Record]:
-    """What is reached of half a unit, and what that does to other traits."""
+    """Measure how much of half a unit is reached, and how other traits change."""
     space, library = default_traits(), default_library()
     names, rng = space.names, np.random.default_rng(0)
     chosen = [library.names[i] for i in rng.choice(len(library), size.reach, replace=False)]
@@ -752,7 +818,7 @@ def _reach(size: _Size, each: Each, say: Say) -> Iterator[Record]:
     how = "three unrelated traits at a time; greatest |change| of a score, 99th percentile "
     how += f"{np.percentile(own, 99.0):.4f}; read off whole tables {change.max():.3f} and "
     how += f"{np.percentile(change, 99.0):.3f}; {refused.sum()} of "
-    how += f"{len(refused)} moves are refused, for what is held forbids them"
+    how += f"{len(refused)} moves are refused, because what is held forbids them"
     yield Record.at_most("unrelated traits, held", float(own.max()), "", 0.02, how=how)
 
 
@@ -778,7 +844,7 @@ def _times(size: _Size, quick: bool) -> Iterator[Record]:
     yield Record.at_most(
         "a drag's next step, median", float(np.median(further)), "ms", 0.5, how=how
     )
-    if not quick:  # as long as all the rest
+    if not quick:  # takes as long as all the rest
         imported, compiled, seconds = first_move()
         if compiled:
             raise RuntimeError(f"the import compiles {compiled} files")
@@ -790,7 +856,7 @@ def _times(size: _Size, quick: bool) -> Iterator[Record]:
 def _compared(
     size: _Size, swept: Sequence[Sweep], plain: Sequence[str], each: Each
 ) -> Iterator[Record]:
-    """The same laws with the straight vectors of Matusik et al. 2003, which hold no colour."""
+    """Measure the same laws for the linear vectors of Matusik et al. 2003, which hold no colour."""
     chosen = starting(size.compared)
     if size is _QUICK:
         plain = plain[::3]

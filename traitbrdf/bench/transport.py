@@ -1,4 +1,4 @@
-"""Errors of frames, of families left out of training, and of shadows."""
+"""Errors of frames: on unseen BRDFs, on families left out of training, and in shadows."""
 
 from __future__ import annotations
 
@@ -30,18 +30,32 @@ from traitbrdf.transport.transport import Transport
 Float64 = NDArray[np.float64]
 
 BENCH_CAMERA = Camera.orbit(-55.0, 30.0, zoom=1.24)
-"""The teapot over 40 % of a square frame, without the ground."""
+"""The teapot covers 40 % of a square frame, without the ground."""
 
 WIDE_CAMERA = Camera.orbit(-55.0, 30.0, zoom=1.65)
-"""The same over 40 % of a frame of 16:9; its foot is cut off."""
+"""The teapot covers 40 % of a frame of 16:9; its foot is cut off."""
 
 
 def bench_scene(environment: EnvironmentMap, size: int | tuple[int, int], **more: Any) -> Scene:
+    """Return the teapot on the ground.
+
+    Parameters
+    ----------
+    environment : EnvironmentMap
+    size : int or (height, width)
+    **more
+        Other settings of `Scene`.
+    """
     return Scene(teapot(), environment, camera=BENCH_CAMERA, size=size, ground=True, **more)
 
 
 def how_much(transport: Transport) -> str:
-    """Pixels, r and bytes of a frame."""
+    """Return a description of a frame: pixels, rank r of the basis, and bytes.
+
+    Parameters
+    ----------
+    transport : Transport
+    """
     scene = transport.scene
     covered = int(np.count_nonzero(scene.uncovered < 1.0))
     return (
@@ -52,7 +66,13 @@ def how_much(transport: Transport) -> str:
 
 
 def transport_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Transport error on unseen BRDFs: compressed frames against the oracle, same tables."""
+    """Measure transport error on unseen BRDFs: compressed frames against the oracle.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, count = (48, 16) if quick else (512, 120)
     library = default_library()
     grid = library.embedding.grid_
@@ -149,7 +169,13 @@ def _spread(errors: Float64) -> str:
 
 
 def family_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Families left out of training: are their frames' errors noticed, and what is shown then?"""
+    """Check families left out of training: are errors noticed, and what is shown then.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, count, members = (40, 24, 4) if quick else (512, 240, 12)
     library = default_library()
     grid = library.embedding.grid_
@@ -166,7 +192,7 @@ def family_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     with Oracle(tables) as oracle:
         for name, environment in maps(data, quick)[:: 1 if data is None else 5]:
             scene = bench_scene(environment, size)
-            # the whole shape is made of the material: its frame is what a person looks at
+            # the whole shape has one material; the error is that of its whole frame
             parts = len(scene.shape.parts)
             own_fragments = np.arange(scene.part_slice(parts - 1).stop)
             area = np.bincount(scene.pixel_part[own_fragments], minlength=parts)
@@ -179,7 +205,7 @@ def family_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
                     for z, f in zip(library.coordinates, library.families, strict=True)
                     if f != family
                 ][:: 6 if quick else 1]
-                # no closed forms either: many of them are what the family is made of
+                # train without analytic models too: some of them make up the family
                 channels = np.concatenate(others, axis=1)
                 training = Training(channels, np.ones(channels.shape[1]))
                 transport = Transport(scene, grid, training, rank=rank, resolution=resolution)
@@ -226,7 +252,13 @@ def family_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def shadow_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
-    """Shadows: the operator in the shade against the oracle, and a small sun's shadow by rays."""
+    """Measure shadows: the operator against the oracle, and a small sun's shadow against rays.
+
+    Parameters
+    ----------
+    data, quick, say
+        As for `traitbrdf.bench.run.Bench`.
+    """
     size, count = (64, 16) if quick else (128, 150)
     library = default_library()
     grid = library.embedding.grid_
@@ -260,7 +292,7 @@ def shadow_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     yield Record.at_most("error in the shade, median", float(np.median(percent)), "%", 1.0, how=how)
     yield Record("error in the shade, maximum", float(percent.max()), "%", how=how)
     right = total = 0
-    # of a size at which a shadow has no penumbra to speak of
+    # suns so small that their shadows have hardly any penumbra
     suns = [(0.28, 0.33, 512), (0.2, 0.6, 256), (0.35, 0.9, 256), (0.15, 0.1, 512)]
     for v, u, rows in suns[: 1 if quick else None]:
         row, column = int(v * rows), int(u * 2 * rows)
@@ -277,8 +309,10 @@ def shadow_error(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
 
 
 def _sharp_shadows(scene: Scene, texel: tuple[int, int], operator: Operator) -> tuple[int, int]:
-    """How many fragments are lit by a map's one bright texel as a ray towards it says, and of
-    how many: those of one sample that do not graze its light."""
+    """Return how many fragments agree with a ray towards the one bright texel, and of how many.
+
+    Only fragments of one sample count whose light does not graze the surface.
+    """
     moment = texel_moments(scene.environment)[texel]
     omega = float(np.linalg.norm(moment))
     toward = moment / omega

@@ -1,1 +1,1 @@
-"""The document: what is painted, as plain values."""
+"""The design as plain values: painted strokes."""

@@ -1,7 +1,7 @@
-"""Painted strokes: polylines on the image, and how much of them lies on each region.
+"""Painted strokes: polylines on the image, and how much of each region they cover.
 
-Arrays only; this module knows neither scenes nor BRDFs. Image coordinates are pixels: x counts
-columns from the left, y rows from the top; the centre of the first pixel is (0.5, 0.5).
+This module works on arrays only; it knows neither scenes nor BRDFs. Image coordinates are pixels: x
+counts columns from the left, y rows from the top, and the centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -9,36 +9,42 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.ndimage
-import scipy.sparse
-import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    import scipy.sparse
+
 Float32 = NDArray[np.float32]
-_FURTHEST = 1e9  # pixels: beyond, squares of distances would lose the brush
+_FURTHEST = 1e9  # pixels; squares of larger distances would not resolve the brush
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """One stroke of a trait brush.
+    """One stroke of a brush.
 
     Parameters
     ----------
     points : sequence of (x, y), at least one
-        The polyline in image pixels; may leave the image.
-    trait : str
+        The polyline in image pixels; it may leave the image.
+    trait : str or None
+        The trait to move; None is a stroke for which `EditSession.paint` is given an effect.
     amount : float
-        Change of the trait's score; 1 is from typically low to typically high.
+        Change of the trait's score; 1 leads from a typically low to a typically high score.
     radius : float
-        Of the brush, in pixels. The brush is full in its inner half and fades to its rim.
-    hold : what shall stay, as for `EditSession.move`; None is what the trait holds by itself
+        Radius of the brush in pixels, positive. The brush has full strength in its inner half and
+        fades to zero at its rim.
+    hold : iterable of str, or None
+        What the edit holds constant, as for `EditSession.move`; None is the default of the trait.
 
     Raises
     ------
-    ValueError, TypeError
-        On no points, or numbers that are not finite, or a radius that is not positive.
+    TypeError
+        On values of another type.
+    ValueError
+        On no points, numbers that are not finite, or a radius that is not positive.
 
     Examples
     --------
@@ -49,8 +55,8 @@ class Stroke:
     """
 
     points: Sequence[tuple[float, float]]
-    trait: str
-    amount: float
+    trait: str | None = None
+    amount: float = 0.0
     radius: float = 24.0
     hold: Iterable[str] | None = None
 
@@ -63,7 +69,7 @@ class Stroke:
             raise ValueError(f"points: expected at least one (x, y), got shape {line.shape}")
         if not np.all(np.abs(line) <= _FURTHEST):
             raise ValueError(f"points: expected finite coordinates of at most {_FURTHEST:g} pixels")
-        if not isinstance(self.trait, str):
+        if self.trait is not None and not isinstance(self.trait, str):
             raise TypeError(f"trait: expected a name, got {self.trait!r}")
         for name in ("amount", "radius"):
             value = getattr(self, name)
@@ -86,15 +92,20 @@ class Stroke:
             object.__setattr__(self, "hold", hold)
 
     def coverage(self, height: int, width: int) -> Float32:
-        """How much the brush covers each pixel of an image, (height, width) in [0, 1].
+        """Return how much the brush covers each pixel of an image, (height, width) in [0, 1].
 
-        A function of the distance to the polyline alone: cutting a segment in two changes
+        It is a function of the distance to the polyline alone, so splitting a segment changes
         nothing.
+
+        Parameters
+        ----------
+        height, width : int
+            Pixels of the image.
         """
         result = np.zeros((height, width), np.float32)
         squared, (y0, y1, x0, x1) = self._distances(height, width)
         squared = squared[y0:y1, x0:x1]
-        # beyond the rim all is the same: do not divide by a tiny radius there
+        # clipped at the rim, so that a tiny radius cannot cause an overflow
         away = np.minimum(np.sqrt(squared), self.radius)
         fade = np.clip(2.0 - 2.0 * away / self.radius, 0.0, 1.0)
         result[y0:y1, x0:x1] = fade * fade * (3.0 - 2.0 * fade)
@@ -103,14 +114,22 @@ class Stroke:
     def extended(
         self, points: Sequence[tuple[float, float]], amount: float | None = None
     ) -> Stroke:
-        """This stroke with more points, and another amount unless that is None.
+        """Return this stroke with more points.
 
-        What this one has measured on an image is handed on, so that a stroke can grow while it is
-        painted without being measured anew.
+        The new stroke reuses the distances that this one has computed, so that a stroke can grow
+        while it is painted.
+
+        Parameters
+        ----------
+        points : sequence of (x, y)
+            Points to append.
+        amount : float or None
+            The new amount; None keeps it.
 
         Raises
         ------
-        As for a new stroke.
+        TypeError, ValueError
+            As for a new stroke.
         """
         amount = self.amount if amount is None else amount
         longer = Stroke((*self.points, *points), self.trait, amount, self.radius, self.hold)
@@ -120,8 +139,10 @@ class Stroke:
         return longer
 
     def _distances(self, height: int, width: int) -> tuple[NDArray[np.float64], tuple[int, ...]]:
-        """Squared distances (height, width) from the polyline, right where they are within reach,
-        and the rows and columns outside of which nothing is."""
+        """Return squared distances (height, width) from the polyline, and the box of valid ones.
+
+        The box is the range of rows and columns that the brush can reach.
+        """
         known = self.__dict__.pop("_measured", None)
         if known is not None and known[0].shape == (height, width):
             squared, box, done = known
@@ -129,7 +150,7 @@ class Stroke:
             squared, box, done = np.full((height, width), np.inf), (height, 0, width, 0), 0
         line = np.asarray(self.points)
         ends = line[1:] if len(line) > 1 else line
-        begun = max(done - 1, 0)  # a dab alone is a segment to itself, which its line covers
+        begun = max(done - 1, 0)  # a single point is a segment from itself to itself
         for (ax, ay), (bx, by) in zip(line[begun:], ends[begun:], strict=False):
             x0 = min(max(math.floor(min(ax, bx) - self.radius), 0), width)
             x1 = min(max(math.ceil(max(ax, bx) + self.radius) + 1, x0), width)
@@ -154,17 +175,21 @@ class Stroke:
 def region_weights(
     coverage: Float32, region: NDArray[np.integer], count: int
 ) -> NDArray[np.float64]:
-    """Share (count,) of the stroke's part on the object that lies on each region.
+    """Return the share (count,) of the stroke's coverage of the object that lies on each region.
 
     Parameters
     ----------
-    coverage : (H, W), from `Stroke.coverage`
-    region : (H, W) integers, the region seen by each pixel; negative where there is none
-    count : number of regions
+    coverage : (H, W) array
+        From `Stroke.coverage`.
+    region : (H, W) int array
+        Index of the region that each pixel shows; negative for none.
+    count : int
+        Number of regions.
 
     Returns
     -------
-    (count,) weights that sum to 1, or all 0 where the stroke misses the object.
+    (count,) float64
+        Weights that sum to 1, or all 0 if the stroke misses the object.
     """
     on = (region >= 0) & (coverage > 0.0)
     totals = np.bincount(region[on], weights=coverage[on], minlength=count)[:count]
@@ -173,23 +198,34 @@ def region_weights(
 
 
 def follow(inside: NDArray[np.bool_]) -> tuple[list[tuple[float, float]], float]:
-    """A stroke that runs along a region and stays within it.
+    """Return a stroke that runs along a region and stays inside it.
 
-    The longest of the shortest paths through the region's largest piece, drawn towards its
-    middle line, and the greatest brush radius that touches nothing outside.
+    It is the longest of the shortest paths through the largest piece of the region, with costs that
+    draw it to the middle; its radius is the greatest that covers nothing outside.
 
     Parameters
     ----------
-    inside : (H, W) mask with at least one pixel
+    inside : (H, W) bool array
+        Mask with at least one pixel.
 
     Returns
     -------
     points : list of (x, y)
-    radius : pixels
+    radius : float
+        Pixels.
+
+    Raises
+    ------
+    ValueError
+        If the mask is empty.
     """
     if not inside.any():
         raise ValueError("inside: expected a region of at least one pixel, got none")
-    # a border of zeros: the rim of the image bounds the region as well
+    # these take a tenth of a second to import, and sessions do not need them
+    import scipy.ndimage
+    import scipy.sparse
+
+    # padded with zeros, because the edge of the image bounds the region as well
     depth = scipy.ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
     pieces, _ = scipy.ndimage.label(depth >= 0.4 * depth.max())
     largest = int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1
@@ -223,6 +259,8 @@ def follow(inside: NDArray[np.bool_]) -> tuple[list[tuple[float, float]], float]
 def _reachable(
     graph: scipy.sparse.csr_array, source: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    import scipy.sparse.csgraph  # imported late, as in `follow`
+
     distance, before = scipy.sparse.csgraph.dijkstra(
         graph, directed=False, indices=source, return_predecessors=True
     )
@@ -230,7 +268,7 @@ def _reachable(
 
 
 def _clear_radius(points: list[tuple[float, float]], inside: NDArray[np.bool_]) -> float:
-    """The greatest radius at which a stroke covers no pixel outside; at least a third pixel."""
+    """Return the greatest radius at which a stroke covers no pixel outside; at least 1/3 pixel."""
     radius = float(max(inside.shape))
     y, x = np.nonzero(~inside)
     outside = np.stack([x + 0.5, y + 0.5], axis=1)

@@ -1,1 +1,1 @@
-"""Bytes in and out, and nothing else: files, images, BRDF files, and what a screen shows."""
+"""Reading and writing files: images, BRDF files and arrays; and the tone curve for display."""

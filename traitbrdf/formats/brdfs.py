@@ -1,4 +1,4 @@
-"""Files of measured BRDFs: MERL `.binary` and RGL `.bsdf`."""
+"""Read and write measured BRDFs: MERL ``.binary`` and RGL ``.bsdf`` files."""
 
 from __future__ import annotations
 
@@ -26,8 +26,12 @@ MERL_SCALE: tuple[float, float, float] = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 15
 def read_merl(path: PathName) -> Float64:
     """Read a MERL ``.binary`` file (Matusik et al., "A Data-Driven Reflectance Model", 2003).
 
-    Three int32 dimensions, then the planes R, G, B of float64; the scale factors `MERL_SCALE` are
-    applied.
+    The file holds three int32 dimensions, then the planes R, G, B in float64. The scale factors
+    `MERL_SCALE` are applied.
+
+    Parameters
+    ----------
+    path : path-like
 
     Returns
     -------
@@ -68,13 +72,13 @@ def read_merl(path: PathName) -> Float64:
 
 
 def write_merl(path: PathName, values: ArrayLike) -> None:
-    """Write a MERL ``.binary`` file; `read_merl` gives the values back to rounding.
+    """Write a MERL ``.binary`` file; `read_merl` returns the same values up to rounding.
 
     Parameters
     ----------
     path : path-like
     values : (n_theta_h, n_theta_d, n_phi_d, 3) array_like
-        f_r in 1/sr on MERL's nodes; 90 x 90 x 180 is what other programs read.
+        f_r in 1/sr at MERL's nodes; other programs expect 90 x 90 x 180.
 
     Raises
     ------
@@ -103,12 +107,22 @@ def write_merl(path: PathName, values: ArrayLike) -> None:
 class RGLFields:
     """The fields of an RGL material file (Dupuy & Jakob 2018), as stored.
 
-    With p azimuths and t elevations of the first direction: `phi_i` (p,) and `theta_i` (t,) in
-    radians, increasing; `sigma` and `ndf` (rows, columns), projected microfacet area and
-    distribution; `vndf` (p, t, rows, columns), a density that warps the square; `luminance`
-    (p, t, n, n) and `rgb` (p, t, 3, n, n), the measurement on the warped square, linear Rec.709.
-    In all of them rows are azimuth and columns are elevation. All are float32 and finite.
-    `jacobian` tells whether the measurement is to be multiplied by ndf / (4 sigma).
+    All arrays are float32 and finite, and have rows along azimuth and columns along elevation. The
+    first direction has p azimuths and t elevations.
+
+    Parameters
+    ----------
+    phi_i, theta_i : (p,) and (t,) arrays
+        Azimuths and elevations of the first direction in radians, increasing.
+    sigma, ndf : (rows, columns) arrays
+        Projected microfacet area and microfacet distribution.
+    vndf : (p, t, rows, columns) array
+        Density of visible normals that warps the unit square.
+    luminance, rgb : (p, t, n, n) and (p, t, 3, n, n) arrays
+        The measurement on the warped square; `rgb` is linear Rec.709.
+    jacobian : bool
+        Whether the measurement must be multiplied by ndf / (4 sigma).
+    description : str
     """
 
     phi_i: Float32
@@ -128,19 +142,23 @@ _RGL_RANKS = {"phi_i": 1, "theta_i": 1, "sigma": 2, "ndf": 2, "vndf": 4, "lumina
 
 
 def read_rgl(path: PathName) -> RGLFields:
-    """Read an RGL ``.bsdf`` material, the RGB kind (Dupuy & Jakob, "An Adaptive Parameterization
-    for Efficient Material Acquisition and Rendering", 2018).
+    """Read an RGL ``.bsdf`` material in its RGB variant.
 
-    The container: ``tensor_file\\0``, version 1.0, the number of fields (uint32); a field is the
-    length of its name (uint16), the name, its rank (uint16), type (uint8), offset in the file
-    (uint64) and shape (uint64 each); little endian.
+    Dupuy & Jakob, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering",
+    2018. The container starts with ``tensor_file`` and a zero byte, the version 1.0 and the number
+    of fields (uint32). A field is the length of its name (uint16), the name, its rank (uint16),
+    type (uint8), offset in the file (uint64) and shape (uint64 each), all little endian.
+
+    Parameters
+    ----------
+    path : path-like
 
     Raises
     ------
     FileNotFoundError
     FormatError
-        If the file is something else, truncated, of another version, without one of the fields
-        (the spectral files have no ``rgb``), or its fields do not fit each other.
+        If the file is something else, truncated, of another version, lacks one of the fields (the
+        spectral files have no ``rgb``), or the shapes of its fields disagree.
     """
     with open_binary(path) as file:
         table = _tensor_table(path, file)
@@ -167,7 +185,7 @@ def read_rgl(path: PathName) -> RGLFields:
 
 
 def _tensor_table(path: PathName, file: BinaryIO) -> dict[str, tuple[str, int, tuple[int, ...]]]:
-    """The (type, offset, shape) of every field, checked to lie within the file."""
+    """Return the (type, offset, shape) of every field, checked to lie within the file."""
     size = file_size(file)
 
     def take(layout: str) -> tuple[Any, ...]:
@@ -196,7 +214,7 @@ def _tensor_table(path: PathName, file: BinaryIO) -> dict[str, tuple[str, int, t
         shape = take(f"<{rank}Q")
         dtype = _TENSOR_TYPES[kind - 1]
         needed = math.prod(shape) * np.dtype(dtype).itemsize
-        if offset + needed > size:  # Python integers: no overflow to hide behind
+        if offset + needed > size:  # Python integers cannot overflow
             raise FormatError(
                 path,
                 f"{name} of shape {shape} within the file",

@@ -1,4 +1,4 @@
-"""From linear radiance to what a screen shows: exposure, tone curve, sRGB."""
+"""Convert linear radiance to display values: exposure, tone curve, sRGB."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
-    """Encode linear Rec.709 values for a display: IEC 61966-2-1, clipped to [0, 1], 8 bits.
+    """Encode linear Rec.709 values as 8-bit sRGB (IEC 61966-2-1), clipped to [0, 1].
 
     Parameters
     ----------
     linear : (..., 3) array_like
-        1 is display white; infinities clip.
+        1 is display white; infinities are clipped.
 
     Returns
     -------
@@ -23,7 +23,7 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
     Raises
     ------
     ValueError
-        On another last axis, or NaN.
+        On another last axis, numbers that are not real, or NaN.
     """
     values = np.asarray(linear)
     if values.dtype.kind not in "fiu":
@@ -38,16 +38,37 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
 
 
 def exposure_of(linear: ArrayLike) -> float:
-    """The exposure at which an image (H, W, 3) looks right: its 90th percentile becomes bright."""
+    """Return the exposure that maps the 90th percentile of an image to a bright value.
+
+    Parameters
+    ----------
+    linear : (..., 3) array_like
+        Linear radiance.
+
+    Returns
+    -------
+    float
+        0.8 over the 90th percentile of the greatest channel; 1 for a black image.
+    """
     bright = float(np.quantile(np.asarray(linear, np.float64).max(axis=-1), 0.9))
     return 0.8 / bright if bright > 0.0 else 1.0
 
 
 def tone_map(linear: ArrayLike, exposure: float = 1.0) -> NDArray[np.uint8]:
-    """A picture (..., 3) uint8 of linear radiance (..., 3): filmic shoulder, then sRGB.
+    """Map linear radiance to 8-bit sRGB with a filmic tone curve.
 
-    The curve is Narkowicz's fit (2015) of the ACES reference rendering; `exposure` scales the
-    radiance first.
+    The curve is Narkowicz's fit (2015) of the ACES reference rendering.
+
+    Parameters
+    ----------
+    linear : (..., 3) array_like
+        Linear radiance.
+    exposure : float
+        Positive factor that scales the radiance first.
+
+    Returns
+    -------
+    (..., 3) uint8
 
     Raises
     ------
@@ -61,11 +82,12 @@ def tone_map(linear: ArrayLike, exposure: float = 1.0) -> NDArray[np.uint8]:
 
 
 class Display:
-    """`tone_map` at one exposure, by table: many times as fast, and within one level of it.
+    """Apply `tone_map` at one exposure from a look-up table: faster, and within one level of it.
 
     Parameters
     ----------
-    exposure : as for `tone_map`
+    exposure : float
+        As for `tone_map`.
     """
 
     _STEPS = 4096
@@ -78,7 +100,7 @@ class Display:
         self._table = np.ascontiguousarray(grey[:, 0])
 
     def __call__(self, linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """(..., 3) uint8 of linear radiance (..., 3) that is not negative and holds no NaN."""
+        """Return 8-bit sRGB (..., 3) of `linear` radiance (..., 3), not negative and not NaN."""
         scaled = linear * np.float32(self.exposure * self._STEPS)
         np.minimum(scaled, np.float32(len(self._table) - 1), out=scaled)
         return self._table[scaled.astype(np.uint16)]

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, plain arrays, and errors that name the file."""
+"""Atomic writes, plain arrays, and errors that name the file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,17 @@ PathName = str | PathLike[str]
 
 
 class FormatError(ValueError):
-    """A file that exists but is not what it should be.
+    """A file exists, but its content is not what was expected.
 
-    The message names the path, what was expected and what came.
+    The message names the path, what was expected and what was found.
+
+    Parameters
+    ----------
+    path : path-like
+    expected : str
+        What the file should hold.
+    got : str
+        What it holds.
     """
 
     def __init__(self, path: PathName, expected: str, got: str) -> None:
@@ -39,22 +47,22 @@ class FormatError(ValueError):
 
 
 def stem(path: PathName) -> str:
-    """The file name without folder and without its last extension."""
+    """Return the file name of `path` without its folder and its last extension."""
     return Path(path).stem
 
 
 @contextlib.contextmanager
 def atomic_path(path: PathName) -> Iterator[Path]:
-    """Write a file whole or not at all.
+    """Write a file completely or not at all.
 
-    Yields the path of a temporary file in the folder of `path` (same extension, not yet created).
-    When the block ends well it replaces `path` in one step; on any exception, an interruption
-    included, it is removed and what stood at `path` stays.
+    Yields the path of a temporary file in the folder of `path`, with the same extension; the file
+    does not exist yet. If the block succeeds, the temporary file replaces `path` in one step. On
+    any exception, including an interruption, it is removed and the old file at `path` stays.
 
     Parameters
     ----------
     path : path-like
-        Where the file shall stand in the end; a symbolic link keeps pointing to its file.
+        Where the file ends up. A symbolic link is followed and stays a link.
 
     Raises
     ------
@@ -74,7 +82,7 @@ def atomic_path(path: PathName) -> Iterator[Path]:
         if not temporary.exists():
             raise FileNotFoundError(f"{path}: nothing was written to {temporary}")
         with temporary.open("rb+") as written:
-            os.fsync(written.fileno())  # else a power cut could leave the new name with no content
+            os.fsync(written.fileno())  # without it a power cut could leave an empty file
         temporary.replace(target)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -82,6 +90,7 @@ def atomic_path(path: PathName) -> Iterator[Path]:
 
 
 def open_binary(path: PathName) -> BinaryIO:
+    """Open the file at `path` for reading bytes; the FileNotFoundError is one short line."""
     try:
         return Path(path).open("rb")
     except FileNotFoundError:
@@ -89,11 +98,22 @@ def open_binary(path: PathName) -> BinaryIO:
 
 
 def file_size(file: BinaryIO) -> int:
+    """Return the size in bytes of an open file `file`."""
     return os.fstat(file.fileno()).st_size
 
 
 def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
-    """The message for a name that does not exist: the near ones, and some that do."""
+    """Return the message for an unknown name: the nearest known names, and some of all names.
+
+    Parameters
+    ----------
+    kind : str
+        What is named, as in "material".
+    name : object
+        The name that was given.
+    known : sequence of str
+        All names that exist.
+    """
     near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4)
     hint = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
     some = ", ".join(known[:12]) + (f", ... ({len(known)} in all)" if len(known) > 12 else "")
@@ -101,25 +121,33 @@ def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
 
 
 # ---------------------------------------------------------------------------------------------
-# The artifact of data_gen
+# Arrays
 
 
 @functools.lru_cache(maxsize=1)
 def artifact() -> dict[str, NDArray[Any]]:
-    """The arrays that ``python -m data_gen`` packed and the package ships."""
+    """Return the arrays that ``python -m data_gen`` packed and the package ships."""
     return read_arrays(resources.files("traitbrdf").joinpath("data", "library.npz"))
 
 
 def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
-    """The named arrays of an ``.npz`` file; nothing in the file is ever executed.
+    """Read the named arrays of an ``.npz`` file; pickled objects are refused.
+
+    So nothing in the file is ever executed.
 
     Parameters
     ----------
-    path : a path, or anything with ``open("rb")``
+    path : path-like, or an object with ``open("rb")``
+
+    Returns
+    -------
+    dict of arrays by name
 
     Raises
     ------
-    FileNotFoundError, FormatError
+    FileNotFoundError
+    FormatError
+        If it is no such file.
     """
     source = Path(path) if isinstance(path, (str, PathLike)) else path
     try:
@@ -133,7 +161,18 @@ def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
 
 
 def write_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays, compressed; atomic. Object arrays are refused (TypeError)."""
+    """Write named arrays to a compressed ``.npz`` file, completely or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+    arrays : mapping of str to array
+
+    Raises
+    ------
+    TypeError
+        On an array of Python objects.
+    """
     for name, value in arrays.items():
         if value.dtype == object:
             raise TypeError(f"{name}: expected plain numbers or text, got objects")

@@ -1,4 +1,4 @@
-"""Images in OpenEXR, Radiance and PNG files."""
+"""Read and write images: OpenEXR, Radiance and PNG."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from PIL import Image
 from traitbrdf.formats.files import FormatError, PathName, atomic_path, file_size, open_binary
 
 Float32 = NDArray[np.float32]
-_MAX_PIXELS = 1 << 27  # 16384 x 8192: an image header that asks for more is taken to be damaged
-_HALF_LIMIT = 65520.0  # from here on a number rounds to infinity in half precision
+_MAX_PIXELS = 1 << 27  # 16384 x 8192; a header that asks for more counts as damaged
+_HALF_LIMIT = 65520.0  # numbers from here on round to infinity in half precision
 
 
 # ---------------------------------------------------------------------------------------------
@@ -25,15 +25,20 @@ _HALF_LIMIT = 65520.0  # from here on a number rounds to infinity in half precis
 
 
 def read_image(path: PathName) -> Float32:
-    """Read a linear image, OpenEXR or Radiance, told apart by content and not by extension.
+    """Read a linear OpenEXR or Radiance image; the content decides, not the extension.
 
     OpenEXR: the channels R, G, B (or Y alone, repeated) of the first part, half or float, the
-    pixels of the data window; alpha is dropped. Radiance: see `_decode_radiance`.
+    pixels of the data window; alpha is dropped. Radiance: flat and run-length encoded scanlines
+    (Ward, "Real Pixels", Graphics Gems II, 1991).
+
+    Parameters
+    ----------
+    path : path-like
 
     Returns
     -------
     (H, W, 3) float32
-        What is stored, also negative or non-finite numbers.
+        The stored values, including negative and non-finite ones.
 
     Raises
     ------
@@ -58,7 +63,7 @@ def read_image(path: PathName) -> Float32:
 
 
 def _read_exr(path: PathName) -> Float32:
-    said = io.StringIO()  # at damage OpenEXR prints, and a library has no business doing so
+    said = io.StringIO()  # OpenEXR prints on damaged files, and a library must not
     try:
         with (
             contextlib.redirect_stdout(said),
@@ -66,12 +71,12 @@ def _read_exr(path: PathName) -> Float32:
         ):
             channels = {name: channel.pixels for name, channel in file.channels().items()}
             sampling = {(c.xSampling, c.ySampling) for c in file.channels().values()}
-    except (RuntimeError, ValueError, TypeError) as error:  # what OpenEXR throws at damage
+    except (RuntimeError, ValueError, TypeError) as error:  # OpenEXR raises these on damage
         got = " ".join(said.getvalue().split()) or str(error)
         raise FormatError(path, "a readable OpenEXR image", got) from error
     if all(name in channels for name in "RGB"):
         planes = [channels[name] for name in "RGB"]
-    elif "Y" in channels and not {"RY", "BY"} & set(channels):  # those hold subsampled chroma
+    elif "Y" in channels and not {"RY", "BY"} & set(channels):  # RY and BY are subsampled chroma
         planes = [channels["Y"]] * 3
     else:
         raise FormatError(
@@ -103,10 +108,10 @@ _EXR_CHUNK_LINES = {
 
 
 def _check_exr(path: PathName, file: BinaryIO) -> None:
-    """Find truncation and absurd sizes before OpenEXR does: it prints, and allocates first.
+    """Find truncation and absurd sizes before OpenEXR, which would print and allocate first.
 
-    Walks header and chunk table as documented in "OpenEXR File Layout"; of multi-part and tiled
-    files only the header is walked, the rest is left to OpenEXR.
+    Walks the header and the chunk table as documented in "OpenEXR File Layout". Of multi-part and
+    tiled files it checks the header only.
     """
     size = file_size(file)
 
@@ -150,7 +155,7 @@ def _check_exr(path: PathName, file: BinaryIO) -> None:
     count = -(-height // _EXR_CHUNK_LINES[compression])
     for offset in np.frombuffer(take(8 * count, "the table of chunks"), "<u8").tolist():
         length = size
-        if 0 < offset <= size - 8:  # a writer that was interrupted leaves zeros in the table
+        if 0 < offset <= size - 8:  # an interrupted writer leaves zeros in the table
             file.seek(offset + 4)
             (length,) = struct.unpack("<I", file.read(4))
         if offset + 8 + length > size:
@@ -160,9 +165,9 @@ def _check_exr(path: PathName, file: BinaryIO) -> None:
 def _decode_radiance(path: PathName, data: bytes) -> Float32:
     """Decode a Radiance picture (Ward, "Real Pixels", Graphics Gems II, 1991).
 
-    Flat, old and new run-length scanlines; rows may run either way, columns too. A pixel is
-    mantissa * 2^(exponent - 136), as most programs have it (Radiance itself adds half a step to
-    the mantissa); EXPOSURE lines are divided out, as the format demands.
+    Handles flat, old and new run-length scanlines, in either direction of rows and columns. A pixel
+    is mantissa * 2^(exponent - 136), as most programs read it (Radiance itself adds half a step to
+    the mantissa). EXPOSURE lines are divided out, as the format demands.
     """
     exposure = 1.0
     position = 0
@@ -198,7 +203,7 @@ def _decode_radiance(path: PathName, data: bytes) -> Float32:
     height, width = int(columns[0]), int(columns[1])
     if height < 1 or width < 1 or width * height > _MAX_PIXELS:
         raise FormatError(path, f"1 to {_MAX_PIXELS} pixels", f"a {width} x {height} image")
-    # the shortest scanline is one run per channel and 127 pixels, or old runs of 2^24 pixels
+    # at best a run holds 127 pixels of a channel, or 2^24 pixels in the old format
     if (len(data) - end) * (1 << 22) < width * height:
         raise FormatError(path, "a complete Radiance image", f"{len(data)} bytes")
     rgbe = _radiance_pixels(path, data, end + 1, height, width)
@@ -215,12 +220,12 @@ def _decode_radiance(path: PathName, data: bytes) -> Float32:
 def _radiance_pixels(
     path: PathName, data: bytes, position: int, height: int, width: int
 ) -> NDArray[np.uint8]:
-    """The (height, width, 4) mantissas and exponents of all scanlines from `position` on."""
+    """Return (height, width, 4) mantissas and exponents of all scanlines from `position` on."""
 
     def damaged(row: int, what: str) -> FormatError:
         return FormatError(path, f"{height} scanlines of {width} pixels", f"{what} in row {row}")
 
-    rows = []  # grown row by row: a header that lies meets the end of the file first
+    rows = []  # row by row: a false size in the header must not allocate memory
     previous = bytes(4)
     for row in range(height):
         start = data[position : position + 4]
@@ -246,7 +251,7 @@ def _radiance_pixels(
             if len(flat) == 4 * width and not markers.all(axis=1).any():
                 pixels = flat.reshape(width, 4)
                 position += 4 * width
-            else:  # old runs: (1, 1, 1, n) repeats the pixel before, shifted 8 bits each time
+            else:  # old runs: (1, 1, 1, n) repeats the previous pixel; n shifts by 8 bits each time
                 line = bytearray()
                 shift = 0
                 while len(line) < 4 * width:
@@ -282,7 +287,7 @@ def _as_image(image: ArrayLike, dtype: Any) -> NDArray[Any]:
 
 
 def write_exr(path: PathName, image: ArrayLike, half: bool = False) -> None:
-    """Write an (H, W, 3) linear image as OpenEXR, channels R, G, B, lossless ZIP.
+    """Write a linear image as OpenEXR with channels R, G, B and lossless ZIP compression.
 
     Parameters
     ----------
@@ -295,7 +300,7 @@ def write_exr(path: PathName, image: ArrayLike, half: bool = False) -> None:
     Raises
     ------
     ValueError
-        On another shape, or a finite number too large for the precision asked for.
+        On another shape, or a finite number too large for the precision.
     """
     pixels = _as_image(image, np.float32)
     limit, kind = (_HALF_LIMIT, np.float16) if half else (3.4028235677973366e38, np.float32)
@@ -309,7 +314,13 @@ def write_exr(path: PathName, image: ArrayLike, half: bool = False) -> None:
 
 
 def write_png(path: PathName, srgb: ArrayLike) -> None:
-    """Write an (H, W, 3) uint8 sRGB image (see `encode_srgb`) as PNG.
+    """Write an sRGB image as PNG.
+
+    Parameters
+    ----------
+    path : path-like
+    srgb : (H, W, 3) uint8 array_like
+        See `encode_srgb`.
 
     Raises
     ------

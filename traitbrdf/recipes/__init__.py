@@ -1,1 +1,1 @@
-"""Procedural materials by family and seed."""
+"""Procedural materials, drawn by family and seed."""

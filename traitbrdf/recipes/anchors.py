@@ -1,4 +1,4 @@
-"""Named materials that stand for their families."""
+"""Named materials that are typical of their families."""
 
 from __future__ import annotations
 
@@ -54,6 +54,7 @@ def _dusty_anchor(name: str, base: Material, dust: RGB, cover: float) -> Materia
 
 
 def anchor_materials() -> list[Material]:
+    """Return the named materials, such as "blue-plastic"; they do not depend on any seed."""
     beige = COLOURS["beige"]
     plain = [
         _named_metal("gold-polished", "gold", "polished-metal", 0.03),

@@ -1,4 +1,4 @@
-"""Families of materials: how members of each are drawn."""
+"""Families of materials, and how the members of each are drawn."""
 
 from __future__ import annotations
 
@@ -52,10 +52,19 @@ from traitbrdf.reflectance.models import (
 
 
 class Draw:
-    """The random choices of one material, independent of all others.
+    """The random choices for one material, independent of all other materials.
 
-    `step` is the material's number in its family: roughnesses step through their range by the
-    golden ratio, so that few members already spread over it.
+    Roughnesses step through their range by the golden ratio, so that even few members spread over
+    it.
+
+    Parameters
+    ----------
+    seed : int
+        Not negative.
+    family : int
+        Index of the family.
+    step : int
+        Number of the material in its family.
     """
 
     def __init__(self, seed: int, family: int, step: int) -> None:
@@ -64,26 +73,49 @@ class Draw:
         self._phase = (offset + step * 0.6180339887498949) % 1.0
 
     def uniform(self, low: float, high: float) -> float:
+        """Return a random number between `low` and `high`."""
         return rounded(self.rng.uniform(low, high))
 
     def log(self, low: float, high: float) -> float:
+        """Return a random number between `low` and `high`, uniform on a logarithmic scale."""
         return rounded(math.exp(self.rng.uniform(math.log(low), math.log(high))))
 
     def spread(self, low: float, high: float) -> float:
-        """Log-spaced in [low, high], stepping evenly from member to member."""
+        """Return a number in [low, high] that steps evenly on a log scale from member to member.
+
+        Parameters
+        ----------
+        low, high : float
+            Above zero.
+        """
         return rounded(math.exp(math.log(low) + self._phase * math.log(high / low)))
 
     def pick(self, names: Mapping[str, RGB] | tuple[str, ...]) -> str:
+        """Return one of `names` at random."""
         options = tuple(names)
         return options[int(self.rng.integers(len(options)))]
 
     def vary(self, colour: RGB, amount: float = 0.15) -> RGB:
-        """`colour` with each channel and the whole changed by some `amount`."""
+        """Return `colour` with random changes of each channel and of the whole.
+
+        Parameters
+        ----------
+        colour : (3,) albedo
+        amount : float
+            Standard deviation of the change of the whole, on a log scale.
+        """
         changes = self.rng.normal(0.0, amount * 0.5, 3) + self.rng.normal(0.0, amount)
         r, g, b = (rounded(min(c * math.exp(x), 0.9)) for c, x in zip(colour, changes, strict=True))
         return r, g, b
 
     def colour(self, names: tuple[str, ...] | None = None) -> tuple[str, RGB]:
+        """Return the name and a varied albedo of one of `COLOURS`.
+
+        Parameters
+        ----------
+        names : tuple of str or None
+            Names to choose from; None is all.
+        """
         name = self.pick(names or COLOURS)
         return name, self.vary(COLOURS[name])
 
@@ -100,7 +132,7 @@ def _metal_family(adjective: str, low: float, high: float) -> _Recipe:
     def make(draw: Draw) -> _Made:
         name = draw.pick(tuple(METALS))
         eta, k = METALS[name]
-        # alloys and treatments differ from the pure element
+        # alloys and treated metals differ from the pure element
         eta = _times(eta, draw.uniform(0.92, 1.08))
         k = _times(k, draw.uniform(0.92, 1.08))
         alpha = draw.spread(low, high)
@@ -293,7 +325,7 @@ def _dusty(draw: Draw) -> _Made:
 
 
 def _reflectance(draw: Draw, metallic: bool) -> tuple[str, RGB]:
-    """Reflectance at normal incidence: of a metal, or of a dielectric, a little tinted at times."""
+    """Return a name and the reflectance at normal incidence of a metal or a dielectric."""
     if not metallic:
         r0 = draw.uniform(0.02, 0.12)
         return "", (r0, r0, r0)
@@ -303,7 +335,7 @@ def _reflectance(draw: Draw, metallic: bool) -> tuple[str, RGB]:
     bare = draw.vary((r, g, b), 0.1)
     if draw.uniform(0.0, 1.0) < 0.6:
         return name, bare
-    # under a clear dye, which light passes twice or more: as saturated as candy wrappers
+    # under a clear dye that light crosses several times, as on saturated candy wrappers
     dye = draw.pick(COLOURS)
     passes = draw.uniform(0.5, 2.0)
     r, g, b = (
@@ -314,7 +346,7 @@ def _reflectance(draw: Draw, metallic: bool) -> tuple[str, RGB]:
 
 
 def _lobe_family(adjective: str, lobe: Callable[[Draw, RGB], tuple[Model, Parameters]]) -> _Recipe:
-    """A lobe by itself as a metal, or over a body: each member draws which."""
+    """Return a recipe: each member is the lobe alone, as a metal, or the lobe over a body."""
 
     def make(draw: Draw) -> _Made:
         metallic = draw.uniform(0.0, 1.0) < 0.35
@@ -322,7 +354,7 @@ def _lobe_family(adjective: str, lobe: Callable[[Draw, RGB], tuple[Model, Parame
         model, values = lobe(draw, r0)
         values["reflectance"] = r0
         if metallic:
-            # no metal is black beside its lobe: light bounces twice, and dust lies on it
+            # interreflection and dust scatter some light even far from a metal's lobe
             share, stray = draw.uniform(0.5, 0.95), draw.log(0.003, 0.05)
             values |= {"share": share, "stray": stray}
             return f"{adjective}-{noun}", share * model + Lambert(stray), values
@@ -398,7 +430,7 @@ def _retro(draw: Draw) -> _Made:
 
 
 def _worn(draw: Draw) -> _Made:
-    """Two materials of other families side by side, finer than the eye: wear, rust, threads."""
+    """Mix two materials of other families, finer than the eye resolves: wear, rust, threads."""
     others = [name for name in RECIPES if name != "worn"]
     share = draw.uniform(0.1, 0.9)
     first, second = (others[int(i)] for i in draw.rng.choice(len(others), 2, replace=False))
@@ -475,4 +507,4 @@ RECIPES: Mapping[str, _Recipe] = MappingProxyType(
 )
 
 FAMILIES: tuple[str, ...] = tuple(RECIPES)
-"""Names of the families, in the order in which they take turns."""
+"""Names of the families, in the order in which `materials` draws from them."""

@@ -1,13 +1,13 @@
-"""Procedural materials: named, seeded, physically plausible reflectances of many families.
+"""Procedural materials: named, seeded and physically plausible, of many families.
 
-`materials` streams them: first curated anchors with plain names ("blue-plastic"), round-robin over
-the families so that any prefix is varied, then random members family by family. Every material is
-isotropic, reciprocal and has a proven or checked albedo of at most 1 (``model.energy_bounded``):
-layers are either coats (`Coated`, `Plastic`), convex mixtures, or sums whose albedos add to at
-most 1. Colours are linear Rec.709 albedos.
+`materials` streams them. First come hand-made anchors with plain names ("blue-plastic"),
+round-robin over the families so that any prefix is varied; then random members, family by family.
+Every material is isotropic and reciprocal and has a proven or checked albedo of at most 1
+(``model.energy_bounded``): layers are coats (`Coated`, `Plastic`), convex mixtures, or sums whose
+albedos add up to at most 1. Colours are linear Rec.709 albedos.
 
-A seed gives the same materials on every processor: numbers are rounded (`_rounded`) before models,
-names or choices depend on them.
+A seed gives the same materials on every processor, because numbers are rounded
+(`traitbrdf.recipes.looks.rounded`) before models, names or choices depend on them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from traitbrdf.recipes.looks import Material
 
 
 def _round_robin(anchors: list[Material]) -> list[Material]:
-    """The first anchor of every family, then the second of every family, and so on."""
+    """Return the first anchor of every family, then the second of every family, and so on."""
     seen: dict[str, int] = {}
     keys = []
     for material in anchors:
@@ -33,23 +33,24 @@ def _round_robin(anchors: list[Material]) -> list[Material]:
 
 
 def materials(seed: int = 0, count: int = 256, start: int = 0) -> Iterator[Material]:
-    """Stream `count` materials: the anchors, then random members, family after family.
+    """Stream materials: the anchors, then random members, family by family.
 
-    A longer stream begins with the shorter one of the same seed, and any stretch of it spreads
-    over the families. The anchors do not depend on the seed.
+    A longer stream begins with the shorter one of the same seed, and any stretch of it covers many
+    families. The anchors do not depend on the seed.
 
     Parameters
     ----------
     seed : int
         Not negative.
     count : int
-        At least 0; thousands are fine, nothing is kept.
+        Total number of materials, at least 0. The stream keeps none of them.
     start : int
-        Leave out so many of the `count`.
+        Number of materials to skip; `count` includes them.
 
     Raises
     ------
     ValueError
+        On anything but integers of at least 0.
     """
     for name, value in (("seed", seed), ("count", count), ("start", start)):
         if not isinstance(value, int | np.integer) or value < 0:
@@ -64,5 +65,5 @@ def _stream(seed: int, count: int, start: int) -> Iterator[Material]:
         step, turn = divmod(i, len(FAMILIES))
         family = FAMILIES[turn]
         name, model, parameters = RECIPES[family](Draw(seed, turn, step))
-        # the number is the member's own in its family: unique without remembering any name
+        # numbered within the family: unique without a list of all names
         yield Material(f"{name}-{step + 1}", family, model, parameters)

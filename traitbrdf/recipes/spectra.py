@@ -1,9 +1,9 @@
-"""Metals from published spectra of n and k, turned to the RGB indices that a model takes.
+"""RGB indices of refraction of metals, from published spectra of n and k.
 
-A spectrum's Fresnel reflectance is weighted by the CIE 1931 observer under D65 and turned to linear
-Rec.709, white being 1 in all channels; each channel's n + ik is the one whose own Fresnel curve is
-nearest to that, over the angles. (One wavelength for each channel is too saturated: a channel sees
-some 100 nm.)
+The Fresnel reflectance of a spectrum is weighted by the CIE 1931 observer under D65 and converted
+to linear Rec.709, where white is 1 in all channels. Each channel's n + ik is the one whose Fresnel
+curve is nearest to that reflectance over the angles. (A single wavelength per channel would be too
+saturated, because a channel covers some 100 nm.)
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ SPECTRA: Mapping[str, tuple[Float64, tuple[float, ...], tuple[float, ...]]] = Ma
 )  # fmt: skip
 """Wavelengths in nm, n and k. Gold, silver and copper: Johnson & Christy, "Optical Constants of the
 Noble Metals", Phys. Rev. B 6 (1972), table I, from 1.64 to 3.25 eV. The others are smooth in the
-visible and stand at three wavelengths: Rakic (1995, 1998), Johnson & Christy (1974) and others, as
-collected by refractiveindex.info; chrome as in the table in common use in renderers."""
+visible range and given at three wavelengths: Rakic (1995, 1998), Johnson & Christy (1974) and
+others, as collected by refractiveindex.info; chrome as in the table that renderers commonly use."""
 
 _D65 = (
     np.arange(380.0, 730.0, 20.0),
@@ -83,15 +83,15 @@ _REC709 = np.array(
 )
 
 _COSINES = np.array([1.0, 0.8, 0.6, 0.4, 0.25, 0.12])
-"""Where Fresnel curves are compared."""
+"""Cosines of incidence at which Fresnel curves are compared."""
 
 
 @functools.lru_cache(maxsize=1)
 def _channels() -> tuple[Float64, Float64]:
-    """Wavelengths (n,) and what each counts for R, G and B (3, n); rows sum to 1.
+    """Return wavelengths (n,) and their weights for R, G and B (3, n); rows sum to 1.
 
-    The observer by Wyman, Sloan & Shirley, "Simple Analytic Approximations to the CIE XYZ Color
-    Matching Functions", JCGT 2 (2013), table 1, multi-lobe.
+    The observer is the multi-lobe fit of Wyman, Sloan & Shirley, "Simple Analytic Approximations to
+    the CIE XYZ Color Matching Functions", JCGT 2 (2013), table 1.
     """
     nm = np.arange(380.0, 721.0, 5.0)
 
@@ -112,19 +112,33 @@ def _channels() -> tuple[Float64, Float64]:
 
 
 def reflectance(name: str, cosine: Float64) -> Float64:
-    """(..., 3) linear Rec.709 Fresnel reflectance in [0, 1] of a metal at cosines (...)."""
+    """Return the linear Rec.709 Fresnel reflectance (..., 3) in [0, 1] of a metal.
+
+    Parameters
+    ----------
+    name : str
+        One of `SPECTRA`.
+    cosine : (...) array
+        Cosines of incidence.
+    """
     nm, share = _channels()
     wavelength, n, k = SPECTRA[name]
     order = np.argsort(wavelength)
     eta, extinction = (np.interp(nm, wavelength[order], np.array(v)[order]) for v in (n, k))
     spectrum = fresnel_conductor(np.asarray(cosine)[..., None], eta, extinction)
-    # a channel of a saturated colour would exceed what any wavelength has
+    # a channel of a saturated colour would exceed the reflectance at every wavelength
     return np.clip(spectrum @ share.T, 0.0, spectrum.max(axis=-1, keepdims=True))
 
 
 @functools.cache
 def indices(name: str) -> tuple[RGB, RGB]:
-    """n and k (R, G, B), to four decimals, whose Fresnel curves are nearest to the spectrum's."""
+    """Return n and k (R, G, B), to four decimals, that fit the spectrum's Fresnel curves best.
+
+    Parameters
+    ----------
+    name : str
+        One of `SPECTRA`.
+    """
     wanted = reflectance(name, _COSINES)
     wavelength, n, k = SPECTRA[name]
     found = []
@@ -135,10 +149,10 @@ def indices(name: str) -> tuple[RGB, RGB]:
             shown = fresnel_conductor(_COSINES, math.exp(point[0]), math.exp(point[1]))
             return np.asarray(shown - curve)
 
-        # a tenth within the ranges of the models: members of the library vary by that
+        # a tenth inside the ranges of the models, because members of the library vary by that
         low, high = np.log([[0.06, 0.06], [4.5, 14.0]])
         start = np.clip(np.log([n[nearest], k[nearest]]), low + 1e-6, high - 1e-6)
-        # to the end, 1e-8 or nearer: what is left depends on the processor, and rounding drops it
+        # converge to 1e-8: the rest depends on the processor, and rounding removes it
         fit = scipy.optimize.least_squares(
             away, start, "3-point", (low, high), xtol=1e-14, ftol=1e-15, gtol=1e-14
         )

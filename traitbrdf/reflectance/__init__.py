@@ -1,1 +1,1 @@
-"""What a surface does with light: tables, closed forms, measurements, descriptors."""
+"""How a surface reflects light: tables, analytic models, measurements and descriptors."""

@@ -1,7 +1,7 @@
 """Tabulated isotropic BRDFs in half/difference angles.
 
-A table holds f_r in 1/sr, WITHOUT the cosine, linear Rec.709 RGB, at the nodes of a
-`HalfDiffGrid`; axes theta_h, theta_d, phi_d, colour. Between nodes `TabulatedBRDF.eval`
+A table holds f_r in 1/sr, WITHOUT the cosine, as linear Rec.709 RGB at the nodes of a
+`HalfDiffGrid`; its axes are theta_h, theta_d, phi_d, colour. Between nodes `TabulatedBRDF.eval`
 interpolates f linearly in the three angles, so that radiance is linear in the table.
 """
 
@@ -13,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import (
@@ -29,32 +28,41 @@ from traitbrdf.directions import (
 from traitbrdf.formats.brdfs import read_merl, write_merl
 from traitbrdf.formats.files import FormatError, stem
 
+if TYPE_CHECKING:
+    import scipy.sparse
+
 Float64 = NDArray[np.float64]
 
 _Bracket: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Float64]
-"""Lower nodes, upper nodes, and the share of the upper ones."""
+"""Indices of the lower nodes, of the upper nodes, and the weights of the upper ones."""
 
 
 class Reflectance(Protocol):
-    """What can be tabulated and integrated: models and tables alike."""
+    """Anything that can be tabulated and integrated: models and tables alike."""
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror (a delta term) beside `eval`."""
+        """Weight (3,) of a perfect mirror (a delta term), in addition to `eval`."""
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """f_r (..., 3) in 1/sr for local unit directions (..., 3), without the cosine."""
+        """Return f_r (..., 3) in 1/sr, without the cosine, for local unit directions.
+
+        Parameters
+        ----------
+        wi, wo : (..., 3) array_like
+            Directions to the light and to the viewer.
+        """
 
 
 @dataclass(frozen=True)
 class HalfDiffGrid:
     """The nodes of a table in half/difference angles (Rusinkiewicz 1998).
 
-    Two layouts, both with theta_h = (x)^2 pi/2 spaced quadratically towards the highlight:
+    There are two layouts. Both space theta_h = x^2 pi/2 quadratically, densest at the highlight:
 
-    - ``"merl"``: node i of n is the lower edge of bin i, as MERL's own (flooring) look-up has
-      it: theta_h = (i/n)^2 pi/2, theta_d = (j/n) pi/2, phi_d = (l/n) pi, periodic in pi by
-      reciprocity. Beyond the last theta node the value is clamped to that node.
+    - ``"merl"``: node i of n is the lower edge of bin i, as in MERL's own (flooring) look-up:
+      theta_h = (i/n)^2 pi/2, theta_d = (j/n) pi/2, phi_d = (l/n) pi, periodic in pi by
+      reciprocity. Beyond the last theta node the value of that node is used.
     - ``"folded"``: both ends are nodes: theta_h = (i/(n-1))^2 pi/2, theta_d = j/(n-1) pi/2,
       phi_d = l/(n-1) pi/2, folded by reciprocity and mirror symmetry.
 
@@ -63,6 +71,11 @@ class HalfDiffGrid:
     n_theta_h, n_theta_d, n_phi_d : int
         Numbers of nodes, at least 2 each.
     layout : "merl" or "folded"
+
+    Raises
+    ------
+    ValueError
+        On fewer nodes, or another layout.
 
     Examples
     --------
@@ -87,49 +100,56 @@ class HalfDiffGrid:
 
     @classmethod
     def merl(cls) -> HalfDiffGrid:
-        """The grid of a MERL ``.binary`` file (Matusik et al. 2003): 90 x 90 x 180."""
+        """Return the grid of a MERL ``.binary`` file (Matusik et al. 2003): 90 x 90 x 180."""
         return cls(90, 90, 180, "merl")
 
     @property
     def shape(self) -> tuple[int, int, int]:
+        """Numbers of nodes along theta_h, theta_d and phi_d."""
         return self.n_theta_h, self.n_theta_d, self.n_phi_d
 
     @property
     def size(self) -> int:
+        """Number of nodes."""
         return self.n_theta_h * self.n_theta_d * self.n_phi_d
 
     def _last(self, count: int) -> int:
-        """The node index that would stand at the far end of an axis of `count` nodes."""
+        """Return the node index at the far end of an axis of `count` nodes."""
         return count if self.layout == "merl" else count - 1
 
     @cached_property
     def theta_h(self) -> Float64:
-        """(n_theta_h,) nodes, radians."""
+        """Nodes (n_theta_h,) in radians."""
         x = np.arange(self.n_theta_h) / self._last(self.n_theta_h)
         return np.asarray(x * x * (math.pi / 2))
 
     @cached_property
     def theta_d(self) -> Float64:
-        """(n_theta_d,) nodes, radians."""
+        """Nodes (n_theta_d,) in radians."""
         return np.asarray(np.arange(self.n_theta_d) / self._last(self.n_theta_d) * (math.pi / 2))
 
     @cached_property
     def phi_d(self) -> Float64:
-        """(n_phi_d,) nodes, radians."""
+        """Nodes (n_phi_d,) in radians."""
         span = math.pi if self.layout == "merl" else math.pi / 2
         return np.asarray(np.arange(self.n_phi_d) / self._last(self.n_phi_d) * span)
 
     def node_angles(self) -> tuple[Float64, Float64, Float64]:
-        """theta_h, theta_d, phi_d of every node, each of the grid's shape."""
+        """Return theta_h, theta_d and phi_d of every node in radians, each of the grid's shape."""
         th, td, pd = np.meshgrid(self.theta_h, self.theta_d, self.phi_d, indexing="ij")
         return th, td, pd
 
     def node_directions(self, min_cos: float = 0.01) -> tuple[Float64, Float64]:
-        """Directions wi, wo, shape (*grid.shape, 3), at which to sample each node.
+        """Return directions wi, wo, each (*grid.shape, 3), at which to sample the nodes.
 
         Where a node has a direction below the horizon, theta_d is lowered until the lower of the
-        two cosines is `min_cos`, so that interpolation next to the horizon meets sensible values
-        and not zeros.
+        two cosines equals `min_cos`. So interpolation next to the horizon meets sensible values,
+        not zeros.
+
+        Parameters
+        ----------
+        min_cos : float
+            Least cosine of either direction, in (0, 1).
         """
         th, td, pd = self.node_angles()
         # both cosines are cos_h cos_d +- sin_h sin_d cos(phi_d): the lower one is
@@ -145,20 +165,25 @@ class HalfDiffGrid:
 
     @cached_property
     def lower_cosine(self) -> Float64:
-        """Grid-shaped cosine of the lower one of a node's two directions; negative below."""
+        """Cosine of the lower of each node's directions, grid-shaped; negative below horizon."""
         th, td, pd = self.node_angles()
         lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * np.abs(np.cos(pd))
         return np.asarray(lower)
 
     @cached_property
     def above_horizon(self) -> NDArray[np.bool_]:
-        """Grid-shaped mask of the nodes with both directions above the horizon."""
+        """Mask, of the grid's shape, of nodes with both directions above the horizon."""
         return np.asarray(self.lower_cosine > 1e-9)
 
     def stencil(
         self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
     ) -> tuple[NDArray[np.int64], Float64]:
-        """The 8 cells and weights that interpolate a table at the given angles (radians).
+        """Return the 8 cells and weights that interpolate a table at the given angles.
+
+        Parameters
+        ----------
+        theta_h, theta_d, phi_d : (...) array_like
+            Radians; they broadcast.
 
         Returns
         -------
@@ -185,7 +210,7 @@ class HalfDiffGrid:
         return index, weight
 
     def _brackets(self, theta_h: Float64, theta_d: Float64, phi_d: Float64) -> list[_Bracket]:
-        """Along each axis the nodes on both sides, and how far from the lower one."""
+        """Return, for each axis, the nodes on both sides and the weight of the upper one."""
         scale = self._last(self.n_theta_d) / (math.pi / 2)
         along = [
             self._bracket_theta_h(theta_h),
@@ -219,7 +244,7 @@ class TabulatedBRDF:
     ----------
     grid : HalfDiffGrid
     values : (n_theta_h, n_theta_d, n_phi_d, 3) array
-        f_r in 1/sr, finite and not negative; float32 and float64 are kept, others become float64.
+        f_r in 1/sr, finite and not negative. float32 and float64 are kept; others become float64.
     mirror : (3,) array
         Weight in [0, 1] of a perfect mirror, a delta term that no table can hold.
     name : str
@@ -258,13 +283,23 @@ class TabulatedBRDF:
 
     @property
     def mirror(self) -> Float64:
+        """Weight (3,) in [0, 1] of a perfect mirror, in addition to the table."""
         return self._mirror
 
     @classmethod
     def from_model(
         cls, model: Reflectance, grid: HalfDiffGrid, name: str = "", dtype: Any = np.float32
     ) -> TabulatedBRDF:
-        """Sample anything with an ``eval`` at the nodes of `grid`."""
+        """Sample a model, or anything else with an ``eval``, at the nodes of a grid.
+
+        Parameters
+        ----------
+        model : Reflectance
+        grid : HalfDiffGrid
+        name : str
+        dtype : float32 or float64
+            Type of the table.
+        """
         wi, wo = grid.node_directions()
         return cls(grid, model.eval(wi, wo).astype(dtype), model.mirror, name)
 
@@ -272,9 +307,15 @@ class TabulatedBRDF:
     def read(cls, path: str | PathLike[str]) -> TabulatedBRDF:
         """Read a MERL ``.binary`` file; invalid (negative) cells become 0.
 
+        Parameters
+        ----------
+        path : path-like
+
         Raises
         ------
-        FileNotFoundError, traitbrdf.formats.files.FormatError
+        FileNotFoundError
+        traitbrdf.formats.files.FormatError
+            As `traitbrdf.formats.brdfs.read_merl`, or on fewer than 2 nodes along an axis.
         """
         values = read_merl(path)
         n_h, n_d, n_p, _ = values.shape
@@ -284,14 +325,16 @@ class TabulatedBRDF:
         return cls(grid, np.maximum(values, 0.0), name=stem(path))
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write a MERL ``.binary`` file, on the 90 x 90 x 180 grid of that format.
+        """Write a MERL ``.binary`` file to `path`, resampled to that format's 90 x 90 x 180 grid.
 
-        The format has no place for `mirror`: it is not written.
+        The format has no field for `mirror`, so it is not written.
         """
         write_merl(path, self.regrid(HalfDiffGrid.merl()).values)
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """f_r (..., 3) in 1/sr, without the cosine; 0 where a direction is not above the horizon.
+        """Return f_r (..., 3) in 1/sr, without the cosine.
+
+        It is 0 unless both directions are above the horizon.
 
         Parameters
         ----------
@@ -307,9 +350,14 @@ class TabulatedBRDF:
         return np.where(visible[..., None], f, 0.0)
 
     def albedo(self, theta_o: ArrayLike) -> Float64:
-        """Directional-hemispherical albedo (..., 3) for view angles `theta_o` (...) in radians.
+        """Return the directional-hemispherical albedo (..., 3).
 
-        The integral of f cos(theta_i) over the hemisphere, mirror included.
+        The integral of f cos(theta_i) over the hemisphere, plus the mirror weight.
+
+        Parameters
+        ----------
+        theta_o : (...) array_like
+            View angles in radians, in [0, pi/2).
         """
         theta = np.asarray(theta_o, np.float64)
         rows = albedo_operator(self.grid, theta.ravel())
@@ -317,14 +365,22 @@ class TabulatedBRDF:
         return np.asarray(result).reshape(*theta.shape, 3)
 
     def max_albedo(self) -> float:
-        """The largest albedo over the 16 check angles (0 to 80 degrees) and the colours.
+        """Return the largest albedo over the 16 check angles (0 to 80 degrees) and the channels.
 
-        The energy check: a passive surface has at most 1.
+        This is the energy check: a passive surface reaches at most 1.
         """
         return float(self.albedo(ALBEDO_ANGLES).max())
 
     def reciprocity_error(self, count: int = 4096, seed: int = 0) -> float:
-        """max |f(wi, wo) - f(wo, wi)| / (1e-3 + f) over `count` random pairs of directions."""
+        """Return max |f(wi, wo) - f(wo, wi)| / (1e-3 + f) over random pairs of directions.
+
+        Parameters
+        ----------
+        count : int
+            Number of pairs.
+        seed : int
+            Seed of the random numbers.
+        """
         rng = np.random.default_rng(seed)
         pairs = rng.normal(size=(2, count, 3))
         pairs[..., 2] = np.abs(pairs[..., 2])
@@ -333,13 +389,13 @@ class TabulatedBRDF:
         return float(np.max(np.abs(forward - backward) / (1e-3 + forward)))
 
     def regrid(self, grid: HalfDiffGrid) -> TabulatedBRDF:
-        """The same BRDF on another grid, log f interpolated (lobes span many decades)."""
+        """Resample to another grid `grid`, interpolating log f (lobes span many decades)."""
         if grid == self.grid:
             return self
         floor = self.values.dtype.type(1e-12)
         logs = np.log(self.values + floor)
         nodes = self.grid._brackets(grid.theta_h, grid.theta_d, grid.phi_d)
-        for axis, (low, high, fraction) in enumerate(nodes):  # grids are products of their axes
+        for axis, (low, high, fraction) in enumerate(nodes):  # the interpolation is separable
             shape = [-1 if a == axis else 1 for a in range(4)]
             part = fraction.astype(logs.dtype).reshape(shape)
             lower = logs.take(low, axis=axis)
@@ -361,17 +417,28 @@ def _mirror_weight(value: ArrayLike) -> Float64:
 
 
 ALBEDO_ANGLES: Float64 = np.radians(np.linspace(0.0, 80.0, 16))
-"""View angles (radians) at which energy is checked and decode is normalised."""
+"""View angles (radians) at which energy is checked and decoded tables are normalised."""
 
 
 def hemisphere_nodes(
     theta_o: float, theta_h: Float64, per_interval: int = 2, azimuths: int = 48
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Quadrature of the light hemisphere around the mirror direction of one view.
+    """Return a quadrature of the light hemisphere, built around the mirror direction of one view.
 
-    Gauss-Legendre between consecutive `theta_h` nodes, ascending (tables are smooth between
-    them), and, on every ring, over exactly the half of azimuths for which wi is above the horizon
-    (the other half is its mirror image), with d omega_i = 4 cos(theta_d) d omega_h.
+    The rule is Gauss-Legendre between consecutive `theta_h` nodes, because tables are smooth
+    between them. On every ring it covers exactly one half of the azimuths for which wi is above the
+    horizon (the other half is its mirror image), with d omega_i = 4 cos(theta_d) d omega_h.
+
+    Parameters
+    ----------
+    theta_o : float
+        View angle in radians, in [0, pi/2).
+    theta_h : (m,) array
+        Nodes in radians, ascending.
+    per_interval : int
+        Gauss-Legendre points between two nodes.
+    azimuths : int
+        Gauss-Legendre points on each ring.
 
     Returns
     -------
@@ -379,7 +446,7 @@ def hemisphere_nodes(
         ``sum(weight * f)`` is the integral of f cos(theta_i) d omega_i.
     """
     x, wx = np.polynomial.legendre.leggauss(per_interval)
-    # between these two the horizon cuts the rings: the integrand has a kink at either
+    # between these two angles the horizon cuts the rings: the integrand has a kink at both
     kinks = np.array([0.25 * math.pi - 0.5 * theta_o, 0.25 * math.pi + 0.5 * theta_o])
     breaks = np.unique(np.concatenate([theta_h, np.clip(kinks, theta_h[0], theta_h[-1])]))
     low, high = breaks[:-1], breaks[1:]
@@ -411,7 +478,19 @@ def hemisphere_nodes(
 
 
 def albedo_operator(grid: HalfDiffGrid, theta_o: ArrayLike) -> scipy.sparse.csr_array:
-    """Sparse rows (n_angles, grid.size) that turn flat tables into directional albedos."""
+    """Return sparse rows (n_angles, grid.size) that turn flat tables into directional albedos.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    theta_o : (n_angles,) array_like
+        View angles in radians, in [0, pi/2).
+
+    Raises
+    ------
+    ValueError
+        On other angles.
+    """
     angles = np.atleast_1d(np.asarray(theta_o, np.float64))
     if angles.ndim != 1 or not np.all((angles >= 0.0) & (angles < math.pi / 2)):
         raise ValueError("theta_o: expected angles in [0, pi/2) radians")
@@ -420,6 +499,8 @@ def albedo_operator(grid: HalfDiffGrid, theta_o: ArrayLike) -> scipy.sparse.csr_
 
 @functools.lru_cache(maxsize=16)
 def _albedo_rows(grid: HalfDiffGrid, angles: tuple[float, ...]) -> scipy.sparse.csr_array:
+    import scipy.sparse  # slow to import, and models and tables do without
+
     nodes = np.unique(np.append(grid.theta_h, math.pi / 2))
     rows = []
     for theta in angles:
@@ -433,7 +514,15 @@ def _albedo_rows(grid: HalfDiffGrid, angles: tuple[float, ...]) -> scipy.sparse.
 
 
 def albedo_of(f: Callable[[Float64, Float64], Array], theta_o: float) -> Float64:
-    """Directional albedo (3,) of a function f(wi, wo) -> (..., 3), by the same quadrature."""
+    """Return the directional albedo (3,) of any reflectance function, by the same quadrature.
+
+    Parameters
+    ----------
+    f : callable
+        f(wi, wo) returns f_r (..., 3) in 1/sr for local unit directions (..., 3).
+    theta_o : float
+        View angle in radians, in [0, pi/2).
+    """
     nodes = HalfDiffGrid(90, 2, 2).theta_h
     th, td, pd, weight = hemisphere_nodes(theta_o, nodes, per_interval=3, azimuths=64)
     wi, wo = from_half_diff_angles(th, td, pd)

@@ -1,15 +1,15 @@
-"""Physical descriptors of a BRDF: what a gloss meter, a colorimeter or a person would read off it.
+"""Physical descriptors of a BRDF, such as a gloss meter or a colorimeter would measure.
 
-Every descriptor looks at values of f alone, never at a model's parameters, so that measured and
-made materials are read alike. `DESCRIPTORS` says of each what it is, its unit and its source.
+Every descriptor depends on values of f alone, never on a model's parameters, so measured and
+synthetic materials are treated alike. `DESCRIPTORS` gives the meaning, unit and source of each.
 
-They are formulas of `READINGS`, a few dozen numbers that are linear in f: f at some angles, the
-flux into a gloss meter's receptor, and an albedo. So they can be had of a table, and of coordinates
-of an embedding without decoding all of it.
+Descriptors are formulas of `READINGS`, a few dozen numbers that are linear in f: f at some angles,
+the flux into a gloss meter's receptor, and albedos. So they can be computed from a table, or from
+the coordinates of an embedding without decoding the whole table.
 
-Two parts of a reflectance are told apart: the *body* is what is left far from the highlight
-(theta_h of 44 to 50 degrees), the *lobe* is what stands above it. No reading takes a direction
-beyond 75 degrees, where measurements are not to be trusted, but for the albedo and "fresnel".
+The formulas separate a reflectance into two parts: the *body* is what remains far from the
+highlight (theta_h of 44 to 50 degrees), and the *lobe* is what rises above it. No reading but the
+albedo and "fresnel" uses a direction beyond 75 degrees, where measurements are unreliable.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ import functools
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import Array, half_diff_angles
 from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF, albedo_operator
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 Float64 = NDArray[np.float64]
 
@@ -42,16 +44,21 @@ _XYZ = np.array(
 )  # linear Rec.709 to CIE XYZ, white D65 (ITU-R BT.709, SMPTE RP 177)
 
 WHITE = _XYZ / _XYZ.sum(axis=1, keepdims=True)
-_SEEN_FROM = math.radians(30.0)  # the angle whose directional albedo is read
+_SEEN_FROM = math.radians(30.0)  # view angle of the albedo reading
 
 _BLACK_GLASS = 0.1000562
-"""Fresnel reflectance of the standard at 60 degrees: n = 1.567 has 100 gloss units (ASTM D523)."""
+"""Fresnel reflectance at 60 degrees of n = 1.567, which defines 100 gloss units (ASTM D523)."""
 
 _BLACK_GLASS_20 = 0.0490782
 
 
 class Descriptor(NamedTuple):
-    """What a descriptor is: one line, its unit, and where it comes from."""
+    """The meaning of a descriptor in one line, its unit, and its source.
+
+    Parameters
+    ----------
+    meaning, unit, source : str
+    """
 
     meaning: str
     unit: str
@@ -68,30 +75,30 @@ DESCRIPTORS: Mapping[str, Descriptor] = MappingProxyType(
         "gloss_20": Descriptor("specular gloss at 20 degrees", "GU", "ASTM D523"),
         "gloss_60": Descriptor("specular gloss at 60 degrees", "GU", "ASTM D523"),
         "haze": Descriptor(
-            "log of the breadth of the lobe to the power of 0.4 over that of the lobe itself",
+            "log ratio of the breadths of the lobe to the power of 0.4 and of the lobe itself",
             "1",
             "a halo around a highlight, whatever its width: hazy gloss, Barla, Pacanowski & "
             "Vangorp 2018; ASTM E430 takes one angle, which wide lobes fill without a halo",
         ),
         "image": Descriptor(
-            "distinctness of image: 1 less reflectance at 0.3 degrees over that at 0",
+            "distinctness of image: 1 minus the reflectance at 0.3 degrees over that at 0",
             "1",
             "ASTM E430; Hunter 1937, distinctness-of-reflected-image gloss",
         ),
         "width": Descriptor(
-            "log of theta_h: integral breadth of the lobe above the body",
+            "log of the integral breadth, in theta_h, of the lobe above the body",
             "log rad",
             "breadth of the lobe; d = 1 - alpha in Pellacini et al. 2000",
         ),
         "sheen": Descriptor(
-            "log of f at theta_h 60 over 40 degrees, both directions near each other",
+            "log ratio of f at theta_h 60 and 40 degrees, light and view close together",
             "1",
             "asperity scattering of cloth and dust, Koenderink & Pont 2003; Hunter's sheen, 1937",
         ),
         "fresnel": Descriptor(
-            "log of the lobe's peak times cosine at 70 over 15 degrees of incidence",
+            "log ratio of the lobe's peak times the cosine at 70 and 15 degrees of incidence",
             "1",
-            "Fresnel: dielectrics rise towards grazing, metals hardly",
+            "Fresnel: dielectrics rise towards grazing, metals hardly do",
         ),
         "lightness": Descriptor(
             "cube root of the luminous albedo at 30 degrees", "1", "CIE 1976 lightness"
@@ -99,15 +106,17 @@ DESCRIPTORS: Mapping[str, Descriptor] = MappingProxyType(
         "specular": Descriptor("luminous albedo of the lobe at 30 degrees", "1", "energy"),
         "diffuse": Descriptor("luminous albedo of the body", "1", "energy"),
         "reflection": Descriptor(
-            "cube root of the specular less that of the diffuse albedo", "1", "energy, as lightness"
+            "cube root of the specular minus that of the diffuse albedo",
+            "1",
+            "energy, on the scale of lightness",
         ),
         "tint": Descriptor(
-            "standard deviation of the log RGB of the lobe, at its peak and in all", "1", "chroma"
+            "standard deviation of the lobe's log RGB, at its peak and as a whole", "1", "chroma"
         ),
         "red": Descriptor(
-            "log of red over the mean log of the others, of the body's and of the lobe's albedo",
+            "log of red minus the mean log of green and blue, summed over body and lobe albedo",
             "1",
-            "a colourless highlight takes nothing from the colour: Todd, Norman & Mingolla 2004",
+            "a colourless highlight does not weaken the colour: Todd, Norman & Mingolla 2004",
         ),
         "green": Descriptor("the same for green", "1", "albedo"),
         "blue": Descriptor("the same for blue", "1", "albedo"),
@@ -116,27 +125,27 @@ DESCRIPTORS: Mapping[str, Descriptor] = MappingProxyType(
         "specular_hue": Descriptor("hue angle of the lobe at its peak", "degrees", "CIELAB, D65"),
         "specular_chroma": Descriptor("chroma of the lobe scaled to white", "C*ab", "CIELAB, D65"),
         "flat": Descriptor(
-            "log of f at theta_h 60 degrees, both directions near each other, over the mirror "
-            "direction's",
+            "log ratio of f at theta_h 60 degrees, light and view close together, and in the "
+            "mirror direction",
             "1",
-            "flat shading of rough surfaces, Oren & Nayar 1994: nothing but the outline is seen",
+            "flat shading of rough surfaces, Oren & Nayar 1994: only the outline is visible",
         ),
         "chroma": Descriptor("chroma of all reflected light at 30 degrees", "C*ab", "CIELAB, D65"),
         "gold": Descriptor(
-            "log distance d of the colours of peak and of all light from gold's, as -log(d + 0.1)",
+            "-log(d + 0.1), d the log distance of the peak's and the albedo's colour from gold's",
             "1",
             "reflectance of gold at normal incidence: Johnson & Christy 1972",
         ),
     }
 )
-"""What `descriptors` reads, in this order."""
+"""All descriptors, in the order in which `descriptors` returns them."""
 
-_DARK = 0.01  # an albedo that has no colour to speak of
+_DARK = 0.01  # an albedo too low to have a colour
 _GOLD = np.log([1.0, 0.753, 0.374])  # linear Rec.709, over the greatest channel
 
 
 def cielab(rgb: ArrayLike) -> Float64:
-    """CIE 1976 L*a*b* (..., 3) of linear Rec.709 RGB (..., 3), white (1, 1, 1) under D65."""
+    """Return CIE 1976 L*a*b* (..., 3) of linear Rec.709 `rgb` (..., 3); white (1, 1, 1) is D65."""
     linear = np.maximum(np.asarray(rgb, np.float64), 0.0)
     xyz = linear @ WHITE.T
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz * (29 / 6) ** 2 / 3 + 4 / 29)
@@ -145,23 +154,23 @@ def cielab(rgb: ArrayLike) -> Float64:
 
 
 def hue(lab: ArrayLike) -> Float64:
-    """Hue angle in degrees [0, 360) and chroma (..., 2) of CIELAB (..., 3)."""
+    """Return hue angle in degrees [0, 360) and chroma as (..., 2) of CIELAB `lab` (..., 3)."""
     colour = np.asarray(lab, np.float64)
     a, b = colour[..., 1], colour[..., 2]
     return np.stack([np.degrees(np.arctan2(b, a)) % 360.0, np.hypot(a, b)], axis=-1)
 
 
-_NODE_D = 90.0 / 23.0  # degrees between the nodes theta_d of the library's grid
+_NODE_D = 90.0 / 23.0  # degrees between the theta_d nodes of the library's grid
 
 
 def _node_h(i: int) -> float:
-    """theta_h in degrees of a node of the library's grid."""
+    """Return theta_h in degrees of node `i` of the library's grid."""
     return 90.0 * (i / 89.0) ** 2
 
 
 _NODES_H = (0, 2, 4, 6, 8, 10, 12, 14, 17, 20, 23, 26, 30, 34, 38, 42, 46, 50, 54, 58, 62, 66)
 PROFILE = tuple(_node_h(i) for i in _NODES_H)
-"""theta_h in degrees at which the profile of the lobe is read; incidence of 16 to 47 degrees."""
+"""theta_h in degrees at which the lobe's profile is read, at incidences of 16 to 47 degrees."""
 
 _MIDDLE = tuple(_NODE_D * i for i in (4, 8, 12))
 _NEAR = tuple(_NODE_D * i for i in (1, 2, 3))
@@ -177,17 +186,24 @@ _POINTS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = MappingProx
         **{f"profile {i}": ((theta,), _MIDDLE) for i, theta in enumerate(PROFILE)},
         "side": (tuple(_node_h(i) for i in (50, 56, 60)), tuple(_NODE_D * i for i in (11, 13, 15))),
     }
-)  # mean f over all pairs of theta_h and theta_d in degrees, phi_d 45 degrees
+)  # each reading is the mean f over all pairs of these theta_h and theta_d, at phi_d 45 degrees
 
 READINGS = ("albedo", "gloss 20", "gloss 60", *_POINTS, "albedo 10", "albedo 60")
-"""What descriptors are made from, and where colours are seen; each linear in f."""
+"""Names of the readings that descriptors and colours are computed from; each is linear in f."""
 
 _AT = MappingProxyType({name: i for i, name in enumerate(READINGS)})
 
 
 @functools.lru_cache(maxsize=16)
 def reading_rows(grid: HalfDiffGrid) -> scipy.sparse.csr_array:
-    """Sparse rows (len(READINGS), grid.size) that turn flat tables into readings."""
+    """Return sparse rows (len(READINGS), grid.size) that turn flat tables into readings.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    """
+    import scipy.sparse  # slow to import, and compiled formulas do without
+
     rows = [albedo_operator(grid, _SEEN_FROM)]
     for angle in (20, 60):
         wi, wo, weight = _receptor(angle)
@@ -203,21 +219,29 @@ def reading_rows(grid: HalfDiffGrid) -> scipy.sparse.csr_array:
 def _row(
     grid: HalfDiffGrid, theta_h: Array, theta_d: Array, phi_d: Array, weight: Float64
 ) -> scipy.sparse.csr_array:
+    import scipy.sparse  # imported late, as in `reading_rows`
+
     index, corner = grid.stencil(theta_h, theta_d, phi_d)
     dense = np.bincount(index.ravel(), (corner * weight[:, None]).ravel(), minlength=grid.size)
     return scipy.sparse.csr_array(np.where(dense > 1e-12, dense, 0.0)[None])
 
 
 def _receptor(angle: int) -> tuple[Float64, Float64, Float64]:
-    """Directions (n, 3) from a gloss meter's lamp and into its receptor, and weights: their sum
-    with f is the flux over that of black glass, in gloss units (ASTM D523).
+    """Return directions and weights that integrate a gloss meter's receptor (ASTM D523).
 
-    The receptor of the standard (1.8 by 3.6 degrees at 20, 4.4 by 11.7 at 60) is filled from a
-    parallel beam; black glass sends all its mirror reflection there.
+    The receptor of the standard (1.8 by 3.6 degrees at 20, 4.4 by 11.7 at 60) is lit by the
+    reflection of a parallel beam. The weighted sum of f is the flux over that of black glass, in
+    gloss units; black glass sends all its mirror reflection into the receptor.
+
+    Returns
+    -------
+    wi, wo : (n, 3) arrays
+        Directions to the lamp and into the receptor.
+    weight : (n,) array
     """
     tall, wide, standard = {20: (1.8, 3.6, _BLACK_GLASS_20), 60: (4.4, 11.7, _BLACK_GLASS)}[angle]
     incident = math.radians(angle)
-    # nodes crowd at the mirror direction, where a polished lobe has all its flux
+    # nodes are densest at the mirror direction, where a polished lobe has all its flux
     x, weight = np.polynomial.legendre.leggauss(24)
     x, weight = 0.5 * (x + 1.0), 0.5 * weight
     node = np.concatenate([-(x[::-1] ** 3), x**3])
@@ -233,13 +257,18 @@ def _receptor(angle: int) -> tuple[Float64, Float64, Float64]:
 
 
 def describe(readings: ArrayLike) -> dict[str, Float64]:
-    """All of `DESCRIPTORS` (...,) of readings (..., len(READINGS), 3), finite numbers."""
+    """Return all `DESCRIPTORS` by name, each (...,), of `readings` (..., len(READINGS), 3)."""
     columns = describe_columns(np.asarray(readings, np.float64))
     return {name: columns[..., i] for i, name in enumerate(DESCRIPTORS)}
 
 
 def describe_columns(readings: Float64) -> Float64:
-    """`describe` as one array (..., len(DESCRIPTORS))."""
+    """Return what `describe` returns as one array (..., len(DESCRIPTORS)).
+
+    Parameters
+    ----------
+    readings : (..., len(READINGS), 3) array
+    """
     flat = np.ascontiguousarray(readings.reshape(-1, *readings.shape[-2:]), np.float64)
     found = np.empty((len(flat), len(DESCRIPTORS)))
     formulas(flat, found)
@@ -255,14 +284,15 @@ _LOG_WIDE = math.log(math.pi / 4)
 _CUBE_ROOT_OF_PI = math.pi ** (1 / 3)
 
 
-# divisions as numpy does them: what raises errors is most of the code that is to be compiled
+# numpy's divisions: code that raises errors would take most of the compile time
 @numba.njit(cache=True, error_model="numpy")
 def formulas(r: Any, out: Any) -> Any:
-    """Fill in `DESCRIPTORS` (m, n) of readings (m, len(READINGS), 3), in their order.
+    """Fill `out` (m, len(DESCRIPTORS)) with `DESCRIPTORS` of readings `r` (m, len(READINGS), 3).
 
-    Compiled: a move of a trait reads them some hundred times.
+    The columns are in the order of `DESCRIPTORS`. Compiled, because one move of a trait evaluates
+    this some hundred times.
     """
-    # sizes that are no constants: for each of those, code that makes an array is compiled
+    # sizes taken from arguments: numba compiles an allocation anew for each constant size
     count, three = r.shape[1], r.shape[2]
     lobe, whole, body_of = np.empty(three), np.empty(three), np.empty(three)
     shed, below, upon = np.empty(three), np.empty(three), np.empty(three)
@@ -292,13 +322,13 @@ def formulas(r: Any, out: Any) -> Any:
         steep = above(light[_STEEP], body, _DARK) * _COS_STEEP
         grazing = above(light[_GRAZING], body, _DARK) * _COS_GRAZING
         mean = square = off_gold = 0.0
-        faint = 0.02 + 0.1 * body  # what stands out less than that has no colour of its own
+        faint = 0.02 + 0.1 * body  # a lobe weaker than that has no colour of its own
         for c in range(3):
             tinted = 0.5 * (math.log(lobe[c] + faint) + math.log(shed[c] + 0.02))
             mean += tinted / 3.0
             square += tinted * tinted / 3.0
             lobe[c] /= peak_lobe
-            # of what is seen in the mirror direction: a faint lobe's own colour is anything
+            # the colour in the mirror direction, because a faint lobe's own colour is noise
             shade = math.log((max(r[m, _PEAK, c], 0.0) + faint) / (top + faint)) - _GOLD[c]
             hue_of_all = math.log((whole[c] + _DARK) / (bright + _DARK)) - _GOLD[c]
             off_gold += (shade * shade + hue_of_all * hue_of_all) / 6.0
@@ -308,7 +338,7 @@ def formulas(r: Any, out: Any) -> Any:
                 below[c] + upon[c] - 0.5 * (below[one] + upon[one] + below[two] + upon[two])
             )
         width, broad = _log_breadths(light, body, known, powers)
-        # a lobe that hardly stands out is as wide as the hemisphere, and has no halo
+        # a lobe that hardly rises above the body counts as wide as the hemisphere, without halo
         stands = max(1.0 - body / max(peak, 1e-4), 0.0)
         outer = math.log(light[_OUTER] + 1e-3)
         out[m, 0] = _CUBE_ROOT_OF_PI * (peak ** (1 / 3) - body ** (1 / 3))
@@ -324,7 +354,7 @@ def formulas(r: Any, out: Any) -> Any:
         out[m, 10] = diffuse
         out[m, 11] = specular ** (1 / 3) - diffuse ** (1 / 3)
         out[m, 12] = _rounded(max(square - mean * mean, 0.0), 0.12)
-        # compiled code of colours is long, so it stands here once
+        # one loop, because the compiled code for a colour is long
         for i in range(3):
             rgb = body_of if i == 0 else lobe if i == 1 else whole
             a, b = _opponents(rgb)
@@ -341,13 +371,13 @@ def formulas(r: Any, out: Any) -> Any:
 
 @numba.njit(cache=True, error_model="numpy")
 def _rounded(square: Any, soft: Any) -> Any:
-    """A distance of which the square is known, without the kink at 0: it has a slope there too."""
+    """Return the root of `square`, smoothed at 0, where the root itself has a kink."""
     return math.sqrt(square + soft * soft) - soft
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _opponents(rgb: Any) -> Any:
-    """a* and b* of one linear RGB, as of `cielab`."""
+    """Return a* and b* of one linear RGB, as `cielab` does."""
     a = b = 0.0
     for i in range(3):
         x = 0.0
@@ -361,26 +391,32 @@ def _opponents(rgb: Any) -> Any:
 
 @numba.njit(cache=True, error_model="numpy")
 def above(whole: Any, body: Any, soft: Any) -> Any:
-    """What of the whole is above the body, never quite nothing: max(whole - body, 0), but smooth,
-    and no more than the whole."""
+    """Return a smooth max(whole - body, 0) that is positive and at most `whole`.
+
+    Parameters
+    ----------
+    whole, body : float
+        Reflectance in total and of the body.
+    soft : float
+        Range in which the maximum is smoothed.
+    """
     over = whole - body
     return min(0.5 * (over + math.sqrt(over * over + soft * soft)), whole)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _log_breadths(light: Any, body: Any, known: Any, powers: Any) -> Any:
-    """log of the integral breadth in theta_h of what the profile has above the body, and
-    of that to the power of 0.4: the width of a box as high as the peak that holds as much, along
-    the root of theta_h.
+    """Return the log integral breadth in theta_h of the lobe, and of the lobe to the power of 0.4.
 
-    An integral, not where a height is crossed: that leaps where a profile has a shelf. `known`
-    and `powers` keep the inverse of a share at each place, and its power.
+    The breadth is the width of a box of equal height and area along the root of theta_h. It is an
+    integral, and not the place where a height is crossed, which would jump where a profile has a
+    shelf. `known` and `powers` cache the inverse of a share at each place, and its power.
     """
     above_body = light[_PEAK] - body + 0.02 * body + 1e-4
     breadth = broad = last = last_broad = 0.0
     for i in range(len(_ROOTS)):
         share = min(max((light[_PEAK + i] - body) / above_body, 0.0), 1.0)
-        # powers are most of the work. Rows of slopes differ hardly: there, a series is as exact
+        # powers are most of the work; finite differences hardly change a share: use a series
         near = share * known[i] - 1.0
         if abs(near) < 1e-3:
             terms = 0.4 + near * (-0.12 + near * (0.064 + near * (-0.0416 + near * 0.029952)))
@@ -399,7 +435,12 @@ def _log_breadths(light: Any, body: Any, known: Any, powers: Any) -> Any:
 
 
 def read(brdf: TabulatedBRDF) -> Float64:
-    """`READINGS` (len(READINGS), 3) of a table; a mirror's delta goes into gloss and albedo."""
+    """Return the `READINGS` (len(READINGS), 3) of a table; its mirror adds to gloss and albedo.
+
+    Parameters
+    ----------
+    brdf : TabulatedBRDF
+    """
     flat = np.asarray(brdf.values, np.float64).reshape(-1, 3)
     readings = np.asarray(reading_rows(brdf.grid) @ flat, np.float64)
     for name, whole in (
@@ -411,5 +452,5 @@ def read(brdf: TabulatedBRDF) -> Float64:
 
 
 def descriptors(brdf: TabulatedBRDF) -> dict[str, float]:
-    """All of `DESCRIPTORS` of one table."""
+    """Return all `DESCRIPTORS` of the table `brdf` by name."""
     return {name: float(value) for name, value in describe(read(brdf)).items()}

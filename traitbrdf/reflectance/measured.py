@@ -1,12 +1,12 @@
 """Measured isotropic materials of the RGL database.
 
-Dupuy & Jakob, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering"
-(ACM TOG 37(6), 2018), sections 4 and 5. A measurement is stored on a unit square that a density of
-visible normals (the vndf, one per elevation of the first direction) warps to the half vectors, so
-that its nodes crowd where the material reflects.
+Dupuy & Jakob, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering" (ACM
+TOG 37(6), 2018), sections 4 and 5. A measurement is stored on a unit square. A density of visible
+normals (the vndf, one per elevation of the first direction) warps the square to the half vectors,
+so that its nodes are dense where the material reflects.
 
-Known weaknesses: the stored quantity includes the cosine of the second direction; dividing it out
-amplifies noise and interpolation error next to the horizon, where also the instrument saw nothing
+Known weaknesses: the stored quantity includes the cosine of the second direction. Dividing it out
+amplifies noise and interpolation error next to the horizon, where the instrument could not measure
 and the data are extrapolated.
 """
 
@@ -27,9 +27,9 @@ Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 MIN_COS = 1e-3
-"""Floor of the cosine that is divided out; lower only within 0.06 degrees of the horizon."""
+"""Floor of the cosine that is divided out; it acts only within 0.06 degrees of the horizon."""
 
-_CHUNK = 1 << 15  # pairs of directions at a time: bounds the temporaries to some 30 MB
+_CHUNK = 1 << 15  # pairs of directions at a time: keeps the temporaries below some 30 MB
 
 
 class MeasuredBRDF:
@@ -38,8 +38,8 @@ class MeasuredBRDF:
     Parameters
     ----------
     fields : traitbrdf.formats.brdfs.RGLFields
-        Of an isotropic material, which has one azimuth (or two, of which the first is taken: the
-        azimuth of the first direction is free).
+        Fields of an isotropic material, which has one azimuth. If it has two, the first is used,
+        because the azimuth of the first direction is arbitrary.
     name : str
 
     Raises
@@ -49,9 +49,9 @@ class MeasuredBRDF:
 
     Notes
     -----
-    With g(wi, wo) the stored quantity, f cos(theta_o), the value is the mean of
-    g(wi, wo) / cos(theta_o) and g(wo, wi) / cos(theta_i), reciprocal by construction; cosines are
-    floored at `MIN_COS`. Negative values, colours out of gamut, are set to 0 before that.
+    With g(wi, wo) the stored quantity, f cos(theta_o), the value is the mean of g(wi, wo) /
+    cos(theta_o) and g(wo, wi) / cos(theta_i), which is reciprocal by construction. Cosines are at
+    least `MIN_COS`. Negative values (colours out of gamut) are set to 0 before the mean is taken.
     """
 
     def __init__(self, fields: RGLFields, name: str = "") -> None:
@@ -74,7 +74,11 @@ class MeasuredBRDF:
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> MeasuredBRDF:
-        """Read a ``.bsdf`` file, named after the file.
+        """Read a ``.bsdf`` file; the BRDF is named after the file.
+
+        Parameters
+        ----------
+        path : path-like
 
         Raises
         ------
@@ -91,11 +95,11 @@ class MeasuredBRDF:
 
     @property
     def mirror(self) -> Float64:
-        """Weight (3,) of a perfect mirror beside `eval`: none."""
+        """Weight (3,) of a perfect mirror, in addition to `eval`: none."""
         return np.zeros(3)
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """f_r in 1/sr, without the cosine; 0 where a direction is not above the horizon.
+        """Return f_r in 1/sr, without the cosine; 0 unless both directions are above the horizon.
 
         Parameters
         ----------
@@ -125,7 +129,7 @@ class MeasuredBRDF:
         return np.asarray(0.5 * (forward + backward))
 
     def _stored(self, first: Float64, half: Float64) -> Float64:
-        """f times the cosine of the other direction, (n, 3), for the half vectors (any length)."""
+        """Return f times the cosine of the other direction, (n, 3); `half` has any length."""
         theta_i, phi_i = _spherical(first)
         theta_m, phi_m = _spherical(half)
         turn = (phi_m - phi_i) / (2.0 * math.pi) + 0.5
@@ -143,7 +147,7 @@ class MeasuredBRDF:
         return value
 
     def _elevation(self, theta_i: Float64) -> tuple[Index, Float64 | None]:
-        """The elevation below (index) and the weight of the next; clamped at both ends."""
+        """Return the index of the elevation below and the weight of the next, both clamped."""
         nodes = self._theta_i
         if len(nodes) == 1:
             return np.zeros(theta_i.shape, np.int64), None
@@ -153,10 +157,10 @@ class MeasuredBRDF:
 
 
 class _Warp:
-    """The inverse of sampling a bilinear density: rows by the marginal, then columns.
+    """The inverse of sampling a bilinear density: first rows by the marginal, then columns.
 
-    Distributions of elevations are normalised first and then interpolated, densities and sums
-    alike, as section 5 and the authors' own reader have it.
+    The distributions of all elevations are normalised first and then interpolated, densities and
+    cumulative sums alike, as in section 5 and in the authors' own reader.
 
     Parameters
     ----------
@@ -178,7 +182,7 @@ class _Warp:
     def invert(
         self, x: Float64, y: Float64, low: Index, weight: Float64 | None
     ) -> tuple[Float64, Float64]:
-        """The point of the unit square that sampling would have carried to (x, y), all (n,)."""
+        """Return the points (n,) of the unit square that sampling would map to (x, y)."""
         _, rows, columns = self._density.shape
         column, row = x * (columns - 1), y * (rows - 1)
         i = np.clip(column.astype(np.int64), 0, columns - 2)
@@ -186,7 +190,7 @@ class _Warp:
         s, t = column - i, row - j
 
         def across(table: Float64, at: Index) -> Float64:
-            """Between the rows j and j + 1, at column `at`."""
+            """Interpolate between the rows j and j + 1, at column `at`."""
             below, above = (_slices(table, low, weight, r * columns + at) for r in (j, j + 1))
             return np.asarray((1.0 - t) * below + t * above)
 
@@ -195,20 +199,20 @@ class _Warp:
         r0, r1 = (_slices(self._along, low, weight, r * columns + last) for r in (j, j + 1))
         mass = (1.0 - t) * r0 + t * r1
         u = across(self._along, i) + s * (c0 + 0.5 * s * (c1 - c0))
-        # a row without mass is never sampled: any point of it will do
+        # a row without mass is never sampled, so any of its points may stand for it
         u = np.where(mass > 0.0, u / np.where(mass > 0.0, mass, 1.0), x)
         v = _slices(self._marginal, low, weight, j) + t * (r0 + 0.5 * t * (r1 - r0))
         return np.clip(u, 0.0, 1.0), np.clip(v, 0.0, 1.0)
 
 
 def _spherical(w: Float64) -> tuple[Float64, Float64]:
-    """Polar angle and azimuth (n,) of vectors (n, 3) of any length."""
+    """Return polar angle and azimuth (n,) of vectors (n, 3) of any length."""
     polar = np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2])
     return np.asarray(polar), np.asarray(np.arctan2(w[:, 1], w[:, 0]))
 
 
 def _slices(table: Float64, low: Index, weight: Float64 | None, at: Index) -> Float64:
-    """Element `at` of every flattened slice `low` of `table`, blended with the next slice."""
+    """Return element `at` of each flattened slice `low`, blended with the next slice."""
     flat = table.reshape(-1)
     size = math.prod(table.shape[1:])
     index = low * size + at

@@ -1,1 +1,1 @@
-"""What is looked at: shapes, lights, a camera."""
+"""The scene: shapes, lights and a camera."""

@@ -22,15 +22,21 @@ class Camera:
 
     Parameters
     ----------
-    azimuth, elevation : degrees
-        Where the camera stands, seen from the target: 0, 0 is on +z, looking along -z with y up;
-        azimuth 90 is on +x, elevation 90 above.
-    fov : degrees, (0, 170)
-        Vertical field of view.
+    azimuth, elevation : float
+        Position of the camera seen from the target, in degrees: 0, 0 is on +z, looking along -z
+        with y up; azimuth 90 is on +x. Elevation is in [-90, 90]; 90 is above.
+    fov : float
+        Vertical field of view in degrees, in (0, 170).
     zoom : float
-        1 fits the shape's bounding sphere into the frame, 2 comes so near that half of it fits.
+        Positive. 1 fits the shape's bounding sphere into the frame; 2 moves so close that half of
+        it fits.
     target : (3,) world position or None
-        What the camera looks at; None is the centre of the shape's bounding sphere.
+        The point that the camera looks at; None is the centre of the shape's bounding sphere.
+
+    Raises
+    ------
+    ValueError
+        On numbers that are out of range or not finite.
     """
 
     azimuth: float = 0.0
@@ -60,17 +66,41 @@ class Camera:
 
     @classmethod
     def orbit(cls, azimuth: float, elevation: float, **settings: Any) -> Camera:
-        """A camera at the given angles in degrees; `settings` are the other parameters."""
+        """Return a camera at the given angles.
+
+        Parameters
+        ----------
+        azimuth, elevation : float
+            Degrees.
+        **settings
+            The other parameters of `Camera`, by name.
+        """
         return cls(azimuth, elevation, **settings)
 
     def rays(self, shape: Shape, height: int, width: int) -> tuple[Float64, Float64]:
-        """Origin (3,) and unit directions (height, width, 3) of the rays through all pixels."""
+        """Return the origin (3,) and unit directions (height, width, 3) of the pixels' rays.
+
+        Parameters
+        ----------
+        shape : Shape
+            The shape that the camera looks at.
+        height, width : int
+            Pixels.
+        """
         x = np.arange(width, dtype=np.float64) + 0.5
         y = np.arange(height, dtype=np.float64) + 0.5
         return self.position(shape, height, width), self.through(height, width, x, y[:, None])
 
     def position(self, shape: Shape, height: int, width: int) -> Float64:
-        """World position (3,) from which it looks at the shape."""
+        """Return the camera's world position (3,).
+
+        Parameters
+        ----------
+        shape : Shape
+            The shape that the camera looks at.
+        height, width : int
+            Pixels.
+        """
         # the bounding sphere has to fit into the narrower side
         narrow = math.atan(self._slope * min(1.0, width / height))
         distance = shape.radius / math.sin(narrow) / self.zoom
@@ -79,7 +109,15 @@ class Camera:
         return position
 
     def through(self, height: int, width: int, x: Float64, y: Float64) -> Float64:
-        """Unit directions (..., 3) through image positions x, y (...): pixels from the top left."""
+        """Return unit directions (..., 3) of the rays through image positions.
+
+        Parameters
+        ----------
+        height, width : int
+            Pixels of the image.
+        x, y : (...) arrays
+            Positions in pixels from the top left corner; they broadcast.
+        """
         a = math.radians(self.azimuth)
         right = np.array([math.cos(a), 0.0, -math.sin(a)])
         up = np.cross(self._back, right)
@@ -102,11 +140,19 @@ class Camera:
 
 
 def dots(a: Float64, b: Float64) -> Float64:
+    """Return the dot products (...) of vectors `a` and `b`, both (..., n)."""
     product: Float64 = np.einsum("...k,...k->...", a, b)
     return product
 
 
 def image_size(size: int | tuple[int, int]) -> tuple[int, int]:
+    """Return (height, width) of `size`, which is that pair or one number for both.
+
+    Raises
+    ------
+    ValueError
+        Unless they are whole numbers from 1 to `MAX_SIDE`.
+    """
     pair = tuple(size) if isinstance(size, (tuple, list, np.ndarray)) else (size, size)
     if len(pair) != 2 or not all(
         isinstance(s, (int, np.integer)) and not isinstance(s, bool) and 1 <= s <= MAX_SIDE

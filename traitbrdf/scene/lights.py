@@ -1,8 +1,8 @@
-"""Light: environment maps, and point and directional lights beside them.
+"""Lights: environment maps, point lights and directional lights.
 
-Radiance is linear Rec.709 RGB in W/(m^2 sr) (any common scale serves: everything is linear in
-it). An environment map is piecewise constant: every texel shines with one radiance over its exact
-solid angle, in every code path, so that two integrators can be compared to the last digit.
+Radiance is linear Rec.709 RGB in W/(m^2 sr). Any common scale works, because everything is linear
+in it. An environment map is piecewise constant: every texel has one radiance over its exact solid
+angle, in every code path. So two integrators can be compared to the last digit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import Array, direction_to_latlong, latlong_to_direction
@@ -28,12 +27,17 @@ Layout = Literal["latlong", "angular", "mirrorball"]
 
 @dataclass(frozen=True)
 class PointLight:
-    """A point that shines equally in all directions.
+    """A point that emits equally in all directions.
 
     Parameters
     ----------
     position : (3,) world position
     intensity : (3,) radiant intensity RGB in W/sr, not negative
+
+    Raises
+    ------
+    ValueError
+        On anything but three finite numbers.
     """
 
     position: tuple[float, float, float]
@@ -44,10 +48,16 @@ class PointLight:
         object.__setattr__(self, "intensity", _triple(self.intensity, "intensity", low=0.0))
 
     def arriving(self, points: Float64) -> tuple[Float64, Float64]:
-        """Directions to the light and irradiance across them, (n, 3) each, at points (n, 3)."""
+        """Return directions to the light and the irradiance on a surface facing it, both (n, 3).
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            World positions.
+        """
         offset = np.asarray(self.position) - points
         squared = np.sum(offset * offset, axis=-1, keepdims=True)
-        # at the light itself there is no direction: no light there rather than infinity
+        # at the light itself the direction is undefined: return no light, not infinity
         apart = squared > 1e-200
         safe = np.where(apart, squared, 1.0)
         irradiance = np.where(apart, np.asarray(self.intensity) / safe, 0.0)
@@ -61,8 +71,13 @@ class DirectionalLight:
 
     Parameters
     ----------
-    direction : (3,) vector towards the light, any length but zero
+    direction : (3,) vector towards the light, of any length but zero
     irradiance : (3,) RGB in W/m^2 on a surface that faces the light, not negative
+
+    Raises
+    ------
+    ValueError
+        On anything but three finite numbers, or a direction of length zero.
     """
 
     direction: tuple[float, float, float]
@@ -73,13 +88,19 @@ class DirectionalLight:
         largest = max(abs(c) for c in raw)
         if largest == 0.0:
             raise ValueError("direction: expected a vector of non-zero length, got (0, 0, 0)")
-        scaled = tuple(c / largest for c in raw)  # the squares neither over- nor underflow
+        scaled = tuple(c / largest for c in raw)  # so that squares neither over- nor underflow
         unit = tuple(c / math.hypot(*scaled) for c in scaled)
         object.__setattr__(self, "direction", unit)
         object.__setattr__(self, "irradiance", _triple(self.irradiance, "irradiance", low=0.0))
 
     def arriving(self, points: Float64) -> tuple[Float64, Float64]:
-        """Directions to the light and irradiance across them, (n, 3) each, at points (n, 3)."""
+        """Return directions to the light and the irradiance on a surface facing it, both (n, 3).
+
+        Parameters
+        ----------
+        points : (n, 3) array
+            World positions.
+        """
         shape = points.shape
         return (
             np.broadcast_to(np.asarray(self.direction), shape),
@@ -103,18 +124,20 @@ def _triple(
 class EnvironmentMap:
     """Light from infinitely far away, on a lat-long grid of M rows by N columns.
 
-    Row 0 is the top (+y); the centre of the image is -z and right of it is +x (see
-    `traitbrdf.directions`). Texel centres lie at +0.5.
+    Row 0 is the top (+y). The centre of the image shows -z, and +x lies to the right of it (see
+    `traitbrdf.directions`). Texel centres are at +0.5.
 
     Parameters
     ----------
-    radiance : (M, N, 3) array
-        Linear RGB, finite and not negative; held as float32.
+    radiance : (M, N, 3) array_like
+        Linear RGB, finite and not negative; stored as float32.
     rotation : float
-        Angle in radians by which the map is turned about +y (counter-clockwise seen from above).
+        Angle in radians by which the map is turned about +y, counter-clockwise seen from above.
 
     Raises
     ------
+    TypeError
+        On values that are not real numbers.
     ValueError
         On a wrong shape, an empty map, or radiance that is negative or not finite.
     """
@@ -132,7 +155,7 @@ class EnvironmentMap:
         if not math.isfinite(rotation):
             raise ValueError(f"rotation: expected a finite angle in radians, got {rotation!r}")
         if image.flags.writeable and np.may_share_memory(image, radiance):
-            image = image.copy()  # what is frozen below is not the caller's array
+            image = image.copy()  # so that the caller's array is not made read-only below
         self.image = image
         self.image.flags.writeable = False
         self.rotation = float(rotation)
@@ -146,21 +169,26 @@ class EnvironmentMap:
     def read(cls, path: str | PathLike[str], layout: Layout = "latlong") -> EnvironmentMap:
         """Read an HDR image (.exr, .hdr).
 
+        Maps that were shrunk with a sharpening filter undershoot next to bright texels. Negative
+        values of at most a quarter of the brightest of the surrounding 7 x 7 texels are taken for
+        such undershoot and set to 0; `clipped_texels` counts them. Any other negative value is an
+        error.
+
         Parameters
         ----------
-        path : path of the file
+        path : path-like
         layout : "latlong", "angular" or "mirrorball"
             Angular maps (Debevec 1998) have -z at the centre and +z at the rim. A mirror ball is
             the picture of a chrome ball by a distant camera that looks along -z: its centre
-            reflects +z. Both are resampled (bilinear) to lat-long.
-
-        Maps that were shrunk with a sharpening filter undershoot next to bright texels. Negative
-        values of at most a quarter of the brightest of the 7 x 7 texels around them are taken for
-        that and set to 0 (`clipped_texels` counts them); any other negative value is an error.
+            reflects +z. Both are resampled to lat-long, bilinearly.
 
         Raises
         ------
-        FileNotFoundError, traitbrdf.formats.files.FormatError
+        FileNotFoundError
+        ValueError
+            On another layout.
+        traitbrdf.formats.files.FormatError
+            If the file is no such image, or its radiance is negative or not finite.
         """
         if layout not in ("latlong", "angular", "mirrorball"):
             raise ValueError(
@@ -177,7 +205,14 @@ class EnvironmentMap:
 
     @classmethod
     def uniform(cls, radiance: ArrayLike = 1.0, rows: int = 16) -> EnvironmentMap:
-        """The same radiance (scalar or RGB) from everywhere: the furnace."""
+        """Return a map with the same radiance from everywhere, as in a white furnace.
+
+        Parameters
+        ----------
+        radiance : float or (3,) array_like
+        rows : int
+            Height of the map; it is twice as wide.
+        """
         return cls(np.broadcast_to(np.asarray(radiance, np.float64), (rows, 2 * rows, 3)))
 
     @classmethod
@@ -187,17 +222,22 @@ class EnvironmentMap:
         softboxes: bool = True,
         rows: int = 128,
     ) -> EnvironmentMap:
-        """A procedural sky that needs no file: gradient, ground, sun and two softboxes.
+        """Return a procedural sky that needs no file: gradient, ground, sun and two softboxes.
 
         Parameters
         ----------
         sun : (azimuth, elevation) in degrees, or None
-            Azimuth as for `Camera.orbit`: 0 is +z, 90 is +x. A disc of 3 degrees radius, large
-            for a sun, so that the map holds it in several texels.
+            Azimuth as for `Camera.orbit`: 0 is +z, 90 is +x. The sun is a disc of 3 degrees radius,
+            larger than the real one, so that it covers several texels.
         softboxes : bool
-            Two bright rectangles, as a photographer's studio has them.
+            Whether to add two bright rectangles, as in a photographer's studio.
         rows : int
             Height of the map; it is twice as wide.
+
+        Raises
+        ------
+        ValueError
+            If `rows` is not a positive integer.
         """
         if not isinstance(rows, int) or rows < 1:
             raise ValueError(f"rows: expected a positive integer, got {rows!r}")
@@ -231,11 +271,11 @@ class EnvironmentMap:
         return cls(image)
 
     def rotated(self, angle: float) -> EnvironmentMap:
-        """The map turned further about +y by `angle` radians."""
+        """Return the map turned further about +y by `angle` radians."""
         return self._like(self.image, self.rotation + angle)
 
     def scaled(self, factor: ArrayLike) -> EnvironmentMap:
-        """The map times a factor (scalar or RGB)."""
+        """Return the map times `factor`, a number or RGB (3,), not negative."""
         return self._like(self.image * np.asarray(factor, np.float32), self.rotation)
 
     def _like(self, image: NDArray[np.float32], rotation: float) -> EnvironmentMap:
@@ -245,23 +285,23 @@ class EnvironmentMap:
 
     @property
     def row_edges(self) -> Float64:
-        """(M + 1,) polar angles of the row borders, radians from +y."""
+        """Polar angles (M + 1,) of the row borders, radians from +y."""
         return np.linspace(0.0, math.pi, self.image.shape[0] + 1)
 
     @cached_property
     def solid_angles(self) -> Float64:
-        """(M,) exact solid angle of a texel of each row, in sr."""
+        """Exact solid angle (M,) of a texel of each row, in sr."""
         edges = self.row_edges
         # cos a - cos b = 2 sin((a + b)/2) sin((b - a)/2), which does not cancel at the poles
         band = 2.0 * np.sin((edges[:-1] + edges[1:]) / 2) * np.sin((edges[1:] - edges[:-1]) / 2)
         return np.asarray(band * (2.0 * math.pi / self.image.shape[1]))
 
     def to_map(self, w: ArrayLike) -> Array:
-        """World directions (..., 3) in the map's own, unrotated frame."""
+        """Turn world directions `w` (..., 3) into the map's own, unrotated frame."""
         return turn_about_y(np.asarray(w), -self.rotation)
 
     def radiance(self, w: ArrayLike) -> Array:
-        """Radiance (..., 3) arriving from world directions (..., 3): that of the texel hit."""
+        """Return the radiance (..., 3) of the texels that world directions `w` (..., 3) hit."""
         m, n, _ = self.image.shape
         u, v = direction_to_latlong(self.to_map(w))
         row = np.clip((v * m).astype(np.int64), 0, m - 1)
@@ -269,19 +309,19 @@ class EnvironmentMap:
         return np.asarray(self.image[row, column])
 
     def backdrop(self, w: ArrayLike) -> Array:
-        """Radiance (..., 3), bilinear between texel centres: for what stands behind the object.
+        """Return the radiance (..., 3) behind the object in world directions `w` (..., 3).
 
-        Looking at the map is no integral over it: texels would only show as blocks.
+        It is bilinear between texel centres: constant texels would be visible as blocks.
         """
         n = self.image.shape[1]
         u, v = direction_to_latlong(self.to_map(w))
         return _bilinear(self.image, u * n - 0.5, v * self.image.shape[0] - 0.5, wrap=True)
 
     def irradiance(self, normals: ArrayLike) -> Float64:
-        """Irradiance (..., 3) on surfaces with world unit normals (..., 3).
+        """Return the irradiance (..., 3) on surfaces with world unit normals `normals` (..., 3).
 
-        The cosine-weighted sum over texels, each at the centroid of its solid angle: exact for
-        texels that the horizon does not cut.
+        The cosine-weighted sum over texels, each at the centroid of its solid angle. It is exact
+        for texels that the horizon does not cut.
         """
         n = self.to_map(np.asarray(normals, np.float64))
         flat = n.reshape(-1, 3)
@@ -294,7 +334,7 @@ class EnvironmentMap:
         return result.reshape(n.shape)
 
     def _bands(self, multiple: int = 1) -> Iterator[slice]:
-        """Rows, some hundred thousand texels at a time: a map may be larger than float64 bears."""
+        """Yield bands of rows of some hundred thousand texels, to limit memory in float64."""
         m, n, _ = self.image.shape
         step = multiple * max((1 << 18) // (n * multiple), 1)
         for start in range(0, m, step):
@@ -302,9 +342,16 @@ class EnvironmentMap:
 
 
 def texel_moments(environment: EnvironmentMap, rows: slice = slice(None)) -> Float64:
-    """(M, N, 3) integral of the direction over each texel: its solid angle times its centroid.
+    """Return the integral (M, N, 3) of the direction over each texel.
 
-    Of the map's `rows` alone if they are given.
+    It is the texel's solid angle times its centroid.
+
+    Parameters
+    ----------
+    environment : EnvironmentMap
+        Its rotation is ignored.
+    rows : slice
+        Rows of the map to compute.
     """
     n = environment.image.shape[1]
     t0, t1 = environment.row_edges[:-1][rows], environment.row_edges[1:][rows]
@@ -324,7 +371,7 @@ def texel_moments(environment: EnvironmentMap, rows: slice = slice(None)) -> Flo
 
 
 def turn_about_y(w: Array, angle: float) -> Array:
-    """Vectors (..., 3) turned about +y by `angle` radians, counter-clockwise seen from above."""
+    """Turn vectors `w` (..., 3) about +y by `angle` radians, counter-clockwise seen from above."""
     if angle == 0.0:
         return w
     c, s = math.cos(angle), math.sin(angle)
@@ -334,7 +381,7 @@ def turn_about_y(w: Array, angle: float) -> Array:
 
 
 def _fault(image: NDArray[np.float32]) -> tuple[str, str] | None:
-    """What is expected of radiance (M, N, 3) and what it is instead; None where all is well."""
+    """Return what is expected of radiance (M, N, 3) and what it is; None if it is valid."""
     bad = int(np.count_nonzero(~np.isfinite(image)))
     if bad:
         return "finite float32 radiance", f"{bad} values that are not"
@@ -345,14 +392,18 @@ def _fault(image: NDArray[np.float32]) -> tuple[str, str] | None:
 
 
 def _ringing(image: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (M, N, 3) of negative values that look like the undershoot of a resampling filter."""
+    """Return the mask (M, N, 3) of negative values that look like resampling undershoot."""
+    if not (image < 0.0).any():
+        return np.zeros(image.shape, bool)
+    import scipy.ndimage  # slow to import, and few maps have negative texels
+
     brightest = scipy.ndimage.maximum_filter(image.max(axis=-1), size=7, mode=("nearest", "wrap"))
     mask: NDArray[np.bool_] = (image < 0.0) & (-image <= 0.25 * brightest[..., None])
     return mask
 
 
 def _bilinear(image: NDArray[np.float32], x: Array, y: Array, wrap: bool) -> Array:
-    """`image` (M, N, 3) at continuous texel indices x, y (centres at integers)."""
+    """Interpolate `image` (M, N, 3) at continuous texel indices x, y (centres at integers)."""
     m, n, _ = image.shape
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = (x - x0)[..., None], (y - y0)[..., None]
@@ -366,7 +417,7 @@ def _bilinear(image: NDArray[np.float32], x: Array, y: Array, wrap: bool) -> Arr
 
 
 def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
-    """A probe image (angular map or mirror ball) resampled to a lat-long map of half its height."""
+    """Resample a probe image (angular map or mirror ball) to a lat-long map of half its height."""
     size_y, size_x, _ = image.shape
     rows = max(size_y // 2, 1)
     v, u = np.meshgrid(
@@ -377,7 +428,7 @@ def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
     safe = np.where(across > 0.0, across, 1.0)
     if layout == "angular":
         r = np.arctan2(across, -w[..., 2]) / math.pi
-    else:  # the ball's normal is the half vector of w and +z: its sine is the radius in the disc
+    else:  # the ball's normal is the half vector of w and +z; its sine is the disc radius
         r = np.sin(0.5 * np.arctan2(across, w[..., 2]))
     x = 0.5 * (1.0 + r * w[..., 0] / safe) * size_x - 0.5
     y = 0.5 * (1.0 - r * w[..., 1] / safe) * size_y - 0.5

@@ -1,4 +1,4 @@
-"""Meshes from OBJ, PLY and glTF files."""
+"""Read meshes from OBJ, PLY and glTF files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 # ------------------------------------------------------------------------------------ mesh files
 _SUFFIXES = (".obj", ".ply", ".gltf", ".glb")
 
-# names that writers give to what has none
+# names that programs write for unnamed pieces
 _PLACEHOLDER = re.compile(r"(geometry|GLTF|mesh|default)?([ _.]?\d+)?", re.IGNORECASE)
 
 
@@ -44,19 +44,21 @@ class _Piece:
 def load_mesh(path: str | PathLike[str]) -> Mesh:
     """Read a mesh file: Wavefront OBJ, PLY, glTF or glb.
 
-    Parts are the named pieces of the file. OBJ: its groups (``g``) where they divide the faces,
-    else its objects (``o``), else its materials (``usemtl``). glTF: its meshes, and the
-    materials within a mesh of several. A file without names is one part, named after the file.
-    Normals are the file's own; where it has none they are averaged over the triangles about a
-    vertex, weighted by their angles, across the borders of parts too. Polygons are split into
-    fans. Nodes of a glTF scene are placed by their transforms; units and axes stay as they are.
-    Texture coordinates are kept, with v upwards; where only some corners have any, the others lie
-    at 0, 0. glTF: those of primitives with a material.
+    Parts are the named pieces of the file. For OBJ they are its groups (``g``) if these divide the
+    faces, else its objects (``o``), else its materials (``usemtl``). For glTF they are its meshes,
+    and the materials within a mesh of several. A file without names is one part, named after the
+    file.
+
+    Normals are those of the file. Where it has none, the normals of the triangles around a vertex
+    are averaged, weighted by their angles, also across the borders of parts. Polygons are split
+    into fans. The nodes of a glTF scene are placed by their transforms; units and axes are not
+    changed. Texture coordinates are kept, with v upwards; corners without any get 0, 0 if others
+    have some. Of a glTF file, only those of primitives with a material are read.
 
     Parameters
     ----------
-    path : str or path
-        Its suffix tells the format.
+    path : path-like
+        Its suffix selects the format.
 
     Raises
     ------
@@ -115,10 +117,10 @@ def load_mesh(path: str | PathLike[str]) -> Mesh:
 
 
 def _smooth_corner_normals(vertices: Float, faces: NDArray[np.int64]) -> Float:
-    """Unit normals (F, 3, 3) of the corners, averaged over all triangles at the same position.
+    """Return unit normals (F, 3, 3) of the corners, averaged over all triangles at one position.
 
     Weighted by the angle of the corner (Thuermer & Wuthrich, "Computing Vertex Normals from
-    Polygonal Facets", 1998), so that the way a polygon was cut does not show.
+    Polygonal Facets", 1998), so that the result does not depend on how a polygon was split.
     """
     _, weld = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0.0 becomes 0.0
     shared = weld.reshape(-1)[faces]
@@ -133,7 +135,7 @@ def _smooth_corner_normals(vertices: Float, faces: NDArray[np.int64]) -> Float:
     sums = [np.bincount(shared.ravel(), weighted[..., k].ravel()) for k in range(3)]
     total = np.stack(sums, axis=-1).astype(np.float64)
     normal = to_unit(total)[shared]
-    # two sides of a sheet may cancel; a triangle without area has no normal and is dropped later
+    # the two sides of a sheet may cancel; triangles without area are dropped later
     flat = dots(facet, facet) == 0.0
     own = np.where(flat[:, None], np.array([0.0, 1.0, 0.0]), facet)
     cancelled = dots(total, total)[shared] < 1e-24
@@ -141,20 +143,20 @@ def _smooth_corner_normals(vertices: Float, faces: NDArray[np.int64]) -> Float:
 
 
 def _read_obj(file: Path) -> list[_Piece]:
-    """Parts of a Wavefront OBJ file in order of appearance.
+    """Return the parts of a Wavefront OBJ file in order of appearance.
 
-    Read here and not by trimesh, which can split a file at its groups but counts relative indices
-    from the file's end, forgets the names of materials without their library, and drops all
-    normals and texture coordinates where one corner has none.
+    trimesh can split a file at its groups, but it counts relative indices from the file's end,
+    forgets the names of materials without their library, and drops all normals and texture
+    coordinates if one corner has none. Hence this reader.
     """
     text = file.read_text("utf-8", errors="replace").replace("\\\n", " ")
-    # one flat list each: lists of rows would keep the garbage collector busy
+    # flat lists: lists of rows would slow down the garbage collector
     tables: dict[str, list[float]] = {"v": [], "vt": [], "vn": []}
-    corners: list[tuple[int, int, int]] = []  # rows of v, vt, vn, or -1; three a triangle
+    corners: list[tuple[int, int, int]] = []  # rows of v, vt, vn, or -1; three per triangle
     labels: list[tuple[str, str, str]] = []  # group, object, material of each triangle
     current = {"g": "", "o": "", "usemtl": ""}
     label = ("", "", "")
-    known: dict[str, tuple[int, int, int]] = {}  # corners seen before: most are, some six times
+    known: dict[str, tuple[int, int, int]] = {}  # corners seen before; most occur several times
     for number, line in enumerate(text.splitlines(), start=1):
         key, *words = line.split("#")[0].split() or [""]
         try:
@@ -183,12 +185,12 @@ def _read_obj(file: Path) -> list[_Piece]:
     if not labels:
         return []
     columns = list(zip(*labels, strict=True))
-    # the first of groups, objects and materials that divides the faces, else any one name
+    # the first of groups, objects and materials that divides the faces, else any name
     divides = [c for c in columns if len(set(c)) > 1]
     named = [c for c in columns[:2] if c[0]]
     names = [*divides, *named, columns[0]][0]
     vertex = np.array(tables["v"]).reshape(-1, 3)
-    # a last row of NaN answers index -1
+    # index -1 selects the last row, which is NaN
     texture = np.array(tables["vt"] + [math.nan] * 2).reshape(-1, 2)
     normal = np.array(tables["vn"] + [math.nan] * 3).reshape(-1, 3)
     face, face_uv, face_normal = np.moveaxis(np.array(corners).reshape(-1, 3, 3), -1, 0)
@@ -212,7 +214,7 @@ def _read_obj(file: Path) -> list[_Piece]:
 def _obj_corner(
     word: str, tables: dict[str, list[float]], known: dict[str, tuple[int, int, int]]
 ) -> tuple[int, int, int]:
-    """Rows of an OBJ corner ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``; -1 where there is none."""
+    """Return the rows of an OBJ corner ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``; -1 for none."""
     fields = [*word.split("/"), "", ""]
 
     def row(field: str, count: int) -> int:
@@ -227,19 +229,19 @@ def _obj_corner(
     try:
         texture = row(fields[1], len(tables["vt"]) // 2) if fields[1] else -1
     except ValueError:
-        texture = -1  # some writers leave the numbers and not the coordinates: no loss to a shape
-    if "-" not in word:  # a relative index depends on where it stands
+        texture = -1  # some programs write indices without coordinates
+    if "-" not in word:  # the meaning of a relative index depends on its place in the file
         known[word] = vertex, texture, normal
     return vertex, texture, normal
 
 
 def _read_trimesh(file: Path) -> list[_Piece]:
-    """Parts of a PLY, glTF or glb file, in the order of the file's geometries."""
+    """Return the parts of a PLY, glTF or glb file, in the order of the file's geometries."""
     try:
         graph, geometries = _load_scene(file)
         uvs = {name: _corner_uvs(g) for name, g in geometries.items()}
         if file.suffix.lower() == ".ply" and not all(np.isnan(uv).all() for uv in uvs.values()):
-            # where trimesh cuts a PLY file's vertices at a texture's seams, it loses their normals
+            # trimesh loses a PLY file's normals where it splits vertices at texture seams
             _, geometries = _load_scene(file, fix_texture=False)
         names = _geometry_names(geometries, file)
         pieces = []
@@ -248,7 +250,7 @@ def _read_trimesh(file: Path) -> list[_Piece]:
             key = str(geometry_key)
             if key in geometries:
                 pieces.append(_placed(geometries[key], np.asarray(matrix), names[key], uvs[key]))
-    # whatever trips a reader over a broken file, the caller needs one kind of error
+    # a broken file raises many kinds of errors in trimesh; callers get one kind
     except Exception as error:
         raise FormatError(
             file, f"a readable {file.suffix.lower()} file", f"{type(error).__name__}: {error}"
@@ -258,10 +260,10 @@ def _read_trimesh(file: Path) -> list[_Piece]:
 
 
 def _load_scene(file: Path, **options: Any) -> tuple[Any, dict[str, trimesh.Trimesh]]:
-    """The scene graph of a file and its geometries that are made of triangles."""
-    import trimesh  # half a second of imports that most sessions never need
+    """Return the scene graph of a file and its geometries that consist of triangles."""
+    import trimesh  # takes half a second to import, and most sessions do not need it
 
-    # unprocessed: trimesh would merge vertices and with them the file's own normals
+    # process=False, or trimesh would merge vertices and lose the file's normals
     scene = trimesh.load(str(file), force="scene", process=False, **options)
     if not isinstance(scene, trimesh.Scene):
         raise TypeError(f"trimesh made a {type(scene).__name__} of it")
@@ -270,7 +272,10 @@ def _load_scene(file: Path, **options: Any) -> tuple[Any, dict[str, trimesh.Trim
 
 
 def _geometry_names(geometries: dict[str, trimesh.Trimesh], file: Path) -> dict[str, str]:
-    """Part names by trimesh's geometry names; materials name the primitives of one glTF mesh."""
+    """Return part names by trimesh's geometry names.
+
+    The primitives of one glTF mesh are named after their materials.
+    """
     names = {key: file.stem if key == file.name else key for key in geometries}
     split = [k for k, g in geometries.items() if g.metadata.get("from_gltf_primitive")]
     materials = {
@@ -285,7 +290,7 @@ def _geometry_names(geometries: dict[str, trimesh.Trimesh], file: Path) -> dict[
 
 
 def _corner_uvs(geometry: trimesh.Trimesh) -> Float:
-    """Texture coordinates (F, 3, 2) of a geometry's corners; NaN where it has none."""
+    """Return texture coordinates (F, 3, 2) of a geometry's corners; NaN where it has none."""
     uv = getattr(geometry.visual, "uv", None)
     if uv is None or np.shape(uv)[:1] != (len(geometry.vertices),):
         uv = np.full((len(geometry.vertices), 2), np.nan)
@@ -294,20 +299,20 @@ def _corner_uvs(geometry: trimesh.Trimesh) -> Float:
 
 
 def _placed(geometry: trimesh.Trimesh, matrix: Float, name: str, uvs: Float) -> _Piece:
-    """A geometry under a node's 4 x 4 transform, with texture coordinates (F, 3, 2)."""
+    """Return a geometry placed by a node's 4 x 4 transform, with texture coordinates (F, 3, 2)."""
     linear = matrix[:3, :3]
-    with np.errstate(invalid="ignore", over="ignore"):  # `load_mesh` looks for such vertices
+    with np.errstate(invalid="ignore", over="ignore"):  # `load_mesh` rejects such vertices
         vertices = np.asarray(geometry.vertices, dtype=np.float64) @ linear.T + matrix[:3, 3]
     faces = np.asarray(geometry.faces, dtype=np.int64).reshape(-1, 3)
     mirrored = np.linalg.det(linear) < 0.0
-    if "vertex_normals" in geometry._cache:  # there only if the file gave them
-        # normals go by the cofactors, which exist for singular transforms as well
+    if "vertex_normals" in geometry._cache:  # present only if the file has normals
+        # the cofactor matrix turns normals, and exists for singular transforms as well
         cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
         turned = np.asarray(geometry.vertex_normals) @ (-cofactor if mirrored else cofactor).T
         normals = turned[faces]
     else:
         normals = np.full((len(faces), 3, 3), np.nan)
-    # a mirror turns the winding round
+    # a mirroring transform reverses the winding
     return _Piece(
         name,
         vertices,

@@ -1,4 +1,4 @@
-"""A scene: a shape under lights, seen by a camera, as fragments of its image."""
+"""A scene: a shape under lights, seen by a camera and split into fragments of its image."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ Bool = NDArray[np.bool_]
 GROUND = "ground"
 """Name of the part that `Scene(..., ground=True)` adds."""
 
-_GROUND_RADIUS = 2.0  # in radii of the shape, unless told
-_CHUNK = 1 << 16  # rays in one call: some 15 ms in which no other thread gets its turn
-_CREASE = math.cos(math.radians(40.0))  # neighbours whose normals differ by more share an edge
-_JUMP = 3.0  # pixels; neighbours that lie further off each other's plane share an edge
-_LIGHT_MARGIN = 1e-5  # of the distance; what is so near to a point light does not hide it
+_GROUND_RADIUS = 2.0  # default, in radii of the shape
+RAYS_AT_ONCE = 1 << 16
+"""Rays in one call: some 15 ms during which no other thread can run."""
+
+_CREASE = math.cos(math.radians(40.0))  # a border lies between normals that differ by more
+_JUMP = 3.0  # pixels; a border lies between pixels further off each other's plane
+_LIGHT_MARGIN = 1e-5  # relative distance to a point light below which nothing hides it
 _SEEN = (
     "part_image", "uncovered", "pixels", "pixel_part", "weights", "bordering", "offsets",
     "normals", "views", "positions", "starts", "_sample_part", "_bounds",
@@ -37,27 +39,29 @@ _SEEN = (
 class Scene:
     """A shape under light, seen by a camera.
 
-    What is shaded are *fragments*, each one part within one pixel. A fragment is sampled once, at
-    the pixel's centre; where the pixel lies at a border of parts, at a silhouette or a crease, it
-    holds as many of `subsamples` samples as hit the part.
+    Shading works on *fragments*: a fragment is one part within one pixel. It is sampled once, at
+    the centre of the pixel. If the pixel is at a border of parts, a silhouette or a crease, the
+    fragment has one sample for each of the `subsamples` rays that hit the part.
 
-    The ground receives the shape's shadows but hides nothing of the map from the shape: the lower
-    half of a captured map *is* the floor's own light, and hiding it would leave undersides black.
-    Point and directional lights beneath the ground do not shine through it.
+    The ground receives the shape's shadows, but it hides nothing of the map from the shape: the
+    lower half of a captured map already *is* the light of the floor, and hiding it would leave
+    undersides black. Point and directional lights beneath the ground do not shine through it.
 
     Parameters
     ----------
-    shape : what is looked at
+    shape : Shape
+        The shape to look at, such as `sphere()`, `teapot()` or a mesh.
     environment : EnvironmentMap or None
         None is `EnvironmentMap.sky()`.
-    lights : point and directional lights beside the map
-    camera : Camera
-        It looks at the shape; the ground changes nothing about the framing.
+    lights : sequence of PointLight and DirectionalLight
+        Lights in addition to the map.
+    camera : Camera or None
+        None is `Camera.orbit(35, 20)`. The ground does not change the framing.
     size : int or (height, width)
         Pixels, 1 to 16384 on a side.
     ground : bool or float
-        Whether a horizontal disc, the part "ground", lies under the shape's lowest point; a
-        number is its radius in radii of the shape, True is 2. From below it is not seen.
+        Whether a horizontal disc, the part "ground", lies under the shape's lowest point. A
+        number is its radius in radii of the shape; True is 2. It is invisible from below.
     shadows : bool
         Whether the shape hides light from itself and from the ground, and the ground from the
         shape.
@@ -67,17 +71,17 @@ class Scene:
     Attributes
     ----------
     parts : tuple of str
-        The shape's parts, and "ground" where there is one.
+        The shape's parts, and "ground" if there is one.
     ground : False or float
         The ground's radius in radii of the shape.
     casts : tuple of bool
-        Whether rays are needed to tell what light reaches each part.
+        For each part, whether shadow rays are needed.
     rays_cast : int
         Shadow rays cast so far.
     part_image : (height, width) int32
         Index of the part at each pixel's centre; -1 for none.
     uncovered : (height * width,) float32
-        Share of each pixel that shows the backdrop: 1 less the weights of its fragments.
+        Share of each pixel that shows the backdrop: 1 minus the weights of its fragments.
     pixels : (P,) int64
         Flat pixel index of each fragment, part by part, ascending in each.
     pixel_part : (P,) int32
@@ -87,16 +91,18 @@ class Scene:
     bordering : (P,) bool
         Whether the fragment lies in a pixel at a border.
     offsets : (P + 1,) int64
-        The samples of fragment f are `offsets[f]` to `offsets[f + 1]`; they all count the same.
+        The samples of fragment f are `offsets[f]` to `offsets[f + 1]`, with equal weights.
     normals, views, positions, starts : (N, 3) float64
-        Of the samples: world unit normals facing the viewer, unit directions towards the viewer,
-        positions, and where shadow rays start.
+        For each sample: the world unit normal facing the viewer, the unit direction towards the
+        viewer, the position, and the start of shadow rays.
 
     Raises
     ------
-    ValueError, TypeError
-        On a size, ground radius or number of subsamples out of range, on lights that are none, or
-        where the shape has a part named "ground" of its own.
+    TypeError
+        On a shape, camera, map or light of another type.
+    ValueError
+        On a size, ground radius or number of subsamples out of range, or if the shape has a part
+        named "ground" of its own.
     """
 
     part_image: Int32
@@ -150,8 +156,8 @@ class Scene:
         self._light(environment, lights, shadows)
 
     def __getattr__(self, name: str) -> Any:
-        # primary rays are shot when something first asks for what they hit: a scene of which only
-        # a small version is drawn yet costs none
+        # primary rays are cast when their hits are first needed: a draft renders a smaller copy
+        # of the scene and needs none of them
         if name in _SEEN:
             self._see()
             return self.__dict__[name]
@@ -160,7 +166,7 @@ class Scene:
     def _light(
         self, environment: EnvironmentMap | None, lights: Sequence[Light], shadows: bool
     ) -> None:
-        """Take the settings that the primary rays do not depend on."""
+        """Set the settings that the primary rays do not depend on."""
         if environment is not None and not isinstance(environment, EnvironmentMap):
             raise TypeError(f"environment: expected an EnvironmentMap, got {environment!r}")
         for light in lights:
@@ -172,7 +178,7 @@ class Scene:
         self.lights = tuple(lights)
         self.shadows = bool(shadows)
         self.rays_cast = 0
-        # seen from within, even a convex shape hides the world
+        # to a camera inside it, even a convex shape hides the world
         stands = self.camera.position(self.shape, self.height, self.width)
         outside = math.dist(stands, self.shape.center) > self.shape.radius
         hides = self.shadows and not (outside and self.shape.convex)
@@ -187,16 +193,21 @@ class Scene:
 
     @property
     def coverage(self) -> float:
-        """Fraction of the frame that the shape covers, the ground left out."""
+        """Fraction of the frame that the shape covers, without the ground."""
         own = slice(0, self.part_slice(len(self.shape.parts) - 1).stop)
         return float(self.weights[own].sum()) / (self.height * self.width)
 
     def part_slice(self, part: int) -> slice:
-        """Where in `pixels` the fragments of one part lie."""
+        """Return the slice of `pixels` that holds the fragments of part index `part`."""
         return slice(self._bounds[part], self._bounds[part + 1])
 
     def samples(self, index: NDArray[np.integer]) -> tuple[Int64, Int64, Float64]:
-        """The samples of fragments (m,), one fragment after the other.
+        """Return the samples of fragments, one fragment after the other.
+
+        Parameters
+        ----------
+        index : (m,) int array
+            Fragments.
 
         Returns
         -------
@@ -205,7 +216,7 @@ class Scene:
         owner : (n,) int64 array
             Which of the m fragments it belongs to, 0 to m - 1.
         share : (n,) float64 array
-            Share of the pixel that it stands for; those of a fragment sum to its weight.
+            Share of the pixel that it represents; the shares of a fragment sum to its weight.
         """
         first = self.offsets[:-1][index]
         count = self.offsets[1:][index] - first
@@ -215,9 +226,14 @@ class Scene:
         return sample, owner, (self.weights[index] / count)[owner]
 
     def changed(self, **settings: Any) -> Scene:
-        """The same shape with other settings of the constructor; those not named stay.
+        """Return a scene of the same shape with some settings changed.
 
-        Where only the light changes (environment, lights, shadows) this costs next to nothing.
+        If only the light changes (environment, lights, shadows), no primary rays are cast again.
+
+        Parameters
+        ----------
+        **settings
+            Parameters of the constructor, by name; the others stay.
 
         Raises
         ------
@@ -240,17 +256,24 @@ class Scene:
         return Scene(self.shape, **chosen)
 
     def backdrop(self) -> NDArray[np.float32]:
-        """The frame (height, width, 3) without the object: the map seen through the camera."""
+        """Return the frame (height, width, 3) without the object: the map behind it."""
         _, rays = self.camera.rays(self.shape, self.height, self.width)
         return np.asarray(self.environment.backdrop(rays), np.float32)
 
-    # -- what light reaches a sample ------------------------------------------------------------
+    # -- light that reaches a sample ------------------------------------------------------------
 
     def visible(self, index: NDArray[np.integer], directions: NDArray[np.floating[Any]]) -> Bool:
-        """Whether light from infinitely far away reaches samples (m,) from `directions` (m, 3).
+        """Return whether light from infinitely far away reaches samples, as booleans (m,).
 
-        Directions are unit vectors towards the light. Those below the surface may count as
-        visible where no rays are needed (`casts`): the cosine rules them out.
+        Directions below the surface may count as visible for parts that need no rays (`casts`),
+        because the cosine term removes them.
+
+        Parameters
+        ----------
+        index : (m,) int array
+            Samples.
+        directions : (m, 3) array
+            Unit vectors towards the light.
 
         Raises
         ------
@@ -272,9 +295,15 @@ class Scene:
         return free
 
     def arriving(self, light: Light, index: NDArray[np.integer]) -> tuple[Float64, Float64]:
-        """Directions to a light and irradiance across them, (m, 3) each, at samples (m,).
+        """Return directions to a light and the irradiance on a surface facing it, both (m, 3).
 
-        Irradiance is zero where the light stands behind the surface or is hidden.
+        Irradiance is zero where the light is behind the surface or hidden.
+
+        Parameters
+        ----------
+        light : PointLight or DirectionalLight
+        index : (m,) int array
+            Samples.
         """
         index = np.asarray(index)
         toward, given = light.arriving(self.positions[index])
@@ -291,7 +320,7 @@ class Scene:
         return toward, np.where(lit[:, None], given, 0.0)
 
     def _cast_rows(self, index: NDArray[np.integer]) -> Int64 | None:
-        """Which of samples (m,) need rays; None for all of them."""
+        """Return which of samples (m,) need rays; None for all of them."""
         if all(self.casts):
             return None
         if not any(self.casts):
@@ -304,15 +333,15 @@ class Scene:
         toward: Float64,
         near: tuple[float, float, float] | None,
     ) -> Bool:
-        """Whether the shape leaves a light free, from samples (n,): of one chunk of rays."""
+        """Return whether light reaches samples (n,) past the shape, in one chunk of rays."""
         self.rays_cast += len(index)
         starts = self.starts[index]
         if near is None:
             return ~self.shape.occluded(starts, toward)
-        # from where the ray starts, the light stands elsewhere than from the surface
+        # the ray starts off the surface, so its direction to the light differs
         offset = np.asarray(near) - starts
         largest = np.abs(offset).max(axis=-1, keepdims=True)
-        scaled = offset / np.where(largest == 0.0, 1.0, largest)  # its square cannot overflow
+        scaled = offset / np.where(largest == 0.0, 1.0, largest)  # so that squares cannot overflow
         length = np.sqrt(dots(scaled, scaled))
         at_light = length == 0.0
         direction = scaled / np.where(at_light, 1.0, length)[:, None]
@@ -323,7 +352,7 @@ class Scene:
     def _under_ground(
         self, points: Float64, toward: Float64, near: tuple[float, float, float] | None
     ) -> Bool:
-        """Whether the ground stands between points (n, 3) above it and a light."""
+        """Return whether the ground is between points (n, 3) above it and a light."""
         down = toward[:, 1] < 0.0
         if near is not None:
             down &= near[1] < self.shape.lowest
@@ -331,8 +360,8 @@ class Scene:
         return hidden
 
     def _over_ground(self, points: Float64, rays: Float64) -> Bool:
-        """Whether downward rays (n, 3) from points (n, 3) above the ground meet its disc."""
-        # times the ray's slope, so that nothing is divided by a slope of next to zero
+        """Return whether downward rays (n, 3) from points (n, 3) above the ground meet its disc."""
+        # multiplied by the ray's slope, to avoid a division by a slope near zero
         slope = np.abs(rays[:, 1:2])
         height = points[..., 1:2] - self.shape.lowest
         across = (points - self.shape.center) * slope + height * rays
@@ -341,10 +370,10 @@ class Scene:
         )
         return inside
 
-    # -- what the camera sees -------------------------------------------------------------------
+    # -- primary rays ---------------------------------------------------------------------------
 
     def _see(self) -> None:
-        """Shoot the primary rays and sort what they hit into fragments."""
+        """Cast the primary rays and sort their hits into fragments."""
         size = self.height * self.width
         y, x = np.divmod(np.arange(size), self.width)
         origin = self.camera.position(self.shape, self.height, self.width)
@@ -354,7 +383,7 @@ class Scene:
             border = self._borders(origin, hits)
         inner = np.flatnonzero((hits.part >= 0) & ~border)
         at_border = np.flatnonzero(border)
-        u, v = _pattern(self.subsamples)
+        u, v = sample_pattern(self.subsamples)
         fine_x = (x[at_border, None] + u).ravel()
         fine_y = (y[at_border, None] + v).ravel()
         fine = self._shoot(origin, fine_x, fine_y)
@@ -362,7 +391,7 @@ class Scene:
 
         pixel = np.concatenate([inner, np.repeat(at_border, self.subsamples)[met]])
         part = np.concatenate([hits.part[inner], fine.part[met]])
-        # part by part, so that a part's fragments are one slice
+        # sorted by part, so that the fragments of a part are one slice
         order = np.argsort(part.astype(np.int64) * size + pixel, kind="stable")
         pixel, part = pixel[order], part[order]
 
@@ -384,7 +413,7 @@ class Scene:
         bordering = border[pixel[first]]
         missed = (hits.part < 0).astype(np.float32)
         missed[at_border] = np.mean(fine.part.reshape(-1, self.subsamples) < 0, axis=1)
-        # all at once: another thread may be asking
+        # in one step, because another thread may read them
         self.__dict__.update(
             part_image=hits.part.reshape(self.height, self.width),
             normals=gathered("normal"), positions=gathered("position"), starts=gathered("start"),
@@ -395,7 +424,7 @@ class Scene:
         )  # fmt: skip
 
     def _shoot(self, origin: Float64, x: Float64, y: Float64) -> Hits:
-        """What the camera at `origin` sees through image positions x, y (n,)."""
+        """Return the hits of rays from the camera at `origin` through image positions x, y (n,)."""
         count = len(x)
         hits = Hits(
             np.full(count, -1, dtype=np.int32),
@@ -415,7 +444,7 @@ class Scene:
         return hits
 
     def _shoot_ground(self, origin: Float64, rays: Float64, rows: slice, hits: Hits) -> None:
-        """Add the ground to `hits[rows]`: from above, it lies behind all of the shape."""
+        """Add the ground to `hits[rows]`; from above, it is behind all of the shape."""
         lowest = self.shape.lowest
         if origin[1] <= lowest:
             return
@@ -428,12 +457,12 @@ class Scene:
         hits.part[at] = len(self.parts) - 1
         hits.normal[at] = (0.0, 1.0, 0.0)
         hits.position[at] = position
-        hits.start[at] = position  # there is nothing in the ground that its rays might meet
+        hits.start[at] = position  # the ground is no part of the mesh, so no offset is needed
 
     def _borders(self, origin: Float64, hits: Hits) -> Bool:
-        """Mask (height * width,) of pixels in whose 3 x 3 neighbourhood something ends.
+        """Return the mask (height * width,) of pixels with a border in their 3 x 3 neighbourhood.
 
-        Another part or nothing is seen, the surface is bent sharply, or it goes on elsewhere.
+        At a border the part changes, the surface bends sharply, or its depth jumps.
         """
         frame = (self.height, self.width)
         part = hits.part.reshape(frame)
@@ -461,14 +490,14 @@ class Scene:
 
 
 def _chunks(count: int) -> list[slice]:
-    """Slices that make up `count` rays, none too long."""
-    return [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
+    """Return slices that divide `count` rays into pieces of at most `RAYS_AT_ONCE`."""
+    return [slice(i, min(i + RAYS_AT_ONCE, count)) for i in range(0, count, RAYS_AT_ONCE)]
 
 
-def _pattern(count: int) -> tuple[Float64, Float64]:
-    """Positions (count,), (count,) in the unit square, one in each of `count` rows and columns.
+def sample_pattern(count: int) -> tuple[Float64, Float64]:
+    """Return positions x, y (count,) in the unit square, one in each of `count` rows and columns.
 
-    So edges along the axes come out in equal steps; the golden ratio tells the rows' order, which
+    So edges along the axes are antialiased in equal steps. The golden ratio orders the rows, which
     spreads the positions well.
     """
     step = np.arange(count)
@@ -477,7 +506,7 @@ def _pattern(count: int) -> tuple[Float64, Float64]:
 
 
 def _ground_radius(ground: bool | float) -> float | Literal[False]:
-    """Radius of the ground in radii of the shape; False for none."""
+    """Return the radius of the ground in radii of the shape; False for none."""
     if isinstance(ground, (bool, np.bool_)):
         return _GROUND_RADIUS if ground else False
     number = isinstance(ground, (int, float, np.integer, np.floating))

@@ -1,12 +1,11 @@
-"""Things to look at: the sphere, Newell's teapot, mesh files; each with named parts.
+"""Shapes: spheres and triangle meshes, each with named parts.
 
-Conventions: the world is y up, rays carry unit directions, lengths have the unit of the shape
-itself. `Hits` holds what a viewer sees: shading normals always face the viewer, whichever side
-of the surface is hit.
+Conventions: the world is y up, rays have unit directions, and lengths have the unit of the shape
+itself. `Hits` holds what a viewer sees: shading normals always face the viewer, whichever side of
+the surface is hit.
 
-A ray that starts *on* a mesh meets that mesh at once: rays that test for shadow start at
-`Hits.start`, a little off it. The sphere ignores hits nearer than 1e-7 of its radius and needs no
-such offset.
+A ray that starts *on* a mesh hits that mesh at once, so shadow rays start at `Hits.start`, slightly
+off the surface. The sphere ignores hits nearer than 1e-7 of its radius and needs no such offset.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import embreex.mesh_construction
 import embreex.rtcore_scene
@@ -23,10 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import as_directions, shading_frame
 
-if TYPE_CHECKING:
-    pass
-
-
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
 Bool = NDArray[np.bool_]
@@ -34,11 +29,11 @@ Bool = NDArray[np.bool_]
 MIN_COSINE = 0.01
 """Least cosine between a mesh's shading normal and the direction to the viewer."""
 
-_MESH_OFFSET = 1e-4  # of the radius; shadow rays start so far off their triangle
-_CONVEX_FACES = 200_000  # more are not looked at: a hull of so many takes a second
-_CONVEX_HEIGHT = 1e-6  # of the radius; neighbours stand out less (files round to float32)
-_CONVEX_VOLUME = 1e-5  # of the volume; what the convex hull may have beyond the mesh
-_SPHERE_SELF_HIT = 1e-7  # of the radius; nearer hits are the surface point that the ray left
+_MESH_OFFSET = 1e-4  # distance of shadow ray starts from their triangle, in radii
+_CONVEX_FACES = 200_000  # larger meshes count as not convex: their hull takes over a second
+_CONVEX_HEIGHT = 1e-6  # in radii; tolerance for bends inwards (files round to float32)
+_CONVEX_VOLUME = 1e-5  # relative excess of the convex hull's volume that is tolerated
+_SPHERE_SELF_HIT = 1e-7  # in radii; nearer hits are the point where the ray starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +60,7 @@ class Hits:
 
 
 class Shape(Protocol):
-    """What a scene asks of a shape.
+    """What a scene needs of a shape.
 
     Attributes
     ----------
@@ -78,37 +73,57 @@ class Shape(Protocol):
     lowest : float
         World y of the lowest point.
     convex : bool
-        True where the shape is known to cast no shadow on itself, seen from outside.
+        True only if the shape, seen from outside, is known to cast no shadow on itself.
     """
 
     @property
-    def parts(self) -> tuple[str, ...]: ...
+    def parts(self) -> tuple[str, ...]:
+        """Unique names of the parts."""
 
     @property
-    def center(self) -> Float: ...
+    def center(self) -> Float:
+        """Centre (3,) of a bounding sphere."""
 
     @property
-    def radius(self) -> float: ...
+    def radius(self) -> float:
+        """Radius of that bounding sphere."""
 
     @property
-    def lowest(self) -> float: ...
+    def lowest(self) -> float:
+        """World y of the lowest point."""
 
     @property
-    def convex(self) -> bool: ...
+    def convex(self) -> bool:
+        """Whether the shape is known to cast no shadow on itself, seen from outside."""
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Nearest hit of each ray: `origins` (n, 3) or (3,), unit `directions` (n, 3)."""
+        """Return the nearest hits of rays.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
+        """
         ...
 
     def occluded(
         self, origins: ArrayLike, directions: ArrayLike, max_distance: ArrayLike = math.inf
     ) -> Bool:
-        """Whether each ray (n, 3) meets the shape before `max_distance`, a number or (n,)."""
+        """Return whether each ray meets the shape before `max_distance`, as booleans (n,).
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
+        max_distance : float or (n,) array_like
+        """
         ...
 
 
 def _as_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float, Float]:
-    """Checked float64 rays, both (n, 3); a single origin (3,) serves all directions."""
+    """Return checked float64 rays, both (n, 3); a single origin (3,) serves all directions."""
     d = as_directions(directions, "directions").astype(np.float64, copy=False)
     o = np.asarray(origins, dtype=np.float64)
     if d.ndim != 2:
@@ -121,7 +136,7 @@ def _as_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float, Float]:
 
 
 def _as_distances(max_distance: ArrayLike, count: int) -> Float:
-    """Checked distances (count,); infinity is allowed."""
+    """Return checked distances (count,); infinity is allowed."""
     m = np.asarray(max_distance, dtype=np.float64)
     if m.shape not in ((), (count,)):
         raise ValueError(f"max_distance: expected a number or shape ({count},), got {m.shape}")
@@ -131,12 +146,13 @@ def _as_distances(max_distance: ArrayLike, count: int) -> Float:
 
 
 def dots(a: Float, b: Float) -> Float:
+    """Return the dot products (...) of vectors `a` and `b`, both (..., n)."""
     product: Float = np.einsum("...k,...k->...", a, b)
     return product
 
 
 def to_unit(v: Float) -> Float:
-    """Vectors (..., 3) of unit length; zero vectors stay zero."""
+    """Scale vectors `v` (..., 3) to unit length; zero vectors stay zero."""
     length = np.sqrt(dots(v, v))
     unit: Float = v / np.where(length == 0.0, 1.0, length)[..., None]
     return unit
@@ -147,9 +163,17 @@ def to_unit(v: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """An exact sphere of one part, "sphere"; made by `sphere`.
+    """An exact sphere with the one part "sphere"; `sphere` makes it.
 
     Its normals are exact up to the silhouette, where the cosine to the viewer goes to zero.
+
+    Parameters
+    ----------
+    radius : float
+    center : (3,) array
+        World position.
+    parts : tuple of str
+    convex : bool
     """
 
     radius: float
@@ -163,9 +187,15 @@ class Sphere:
         return float(self.center[1]) - self.radius
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Nearest hits of rays from `origins` (n, 3) or (3,) along unit `directions` (n, 3).
+        """Return the nearest hits of rays.
 
-        From inside, the far wall is hit and its normal points inwards, to the viewer.
+        From inside, a ray hits the far wall, whose normal then points inwards, to the viewer.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
 
         Raises
         ------
@@ -179,17 +209,25 @@ class Sphere:
         outward = to_unit(offset[hit] + t[hit, None] * d[hit])
         position = np.zeros(d.shape)
         normal = np.zeros(d.shape)
-        # from the normal, so that the point lies on the sphere however far away the ray starts
+        # computed from the normal, so that the point lies on the sphere even for distant origins
         position[hit] = self.center + self.radius * outward
         facing = dots(outward, d[hit]) <= 0.0
         normal[hit] = np.where(facing[:, None], outward, -outward)
-        # shadow rays may start on the sphere itself: `_distance` overlooks where they start
+        # shadow rays may start on the sphere itself: `_distance` ignores their start
         return Hits(np.where(hit, 0, -1).astype(np.int32), position, normal, position)
 
     def occluded(
         self, origins: ArrayLike, directions: ArrayLike, max_distance: ArrayLike = math.inf
     ) -> Bool:
-        """Whether rays (n, 3) meet the sphere before `max_distance`, a number or (n,).
+        """Return whether rays meet the sphere before `max_distance`, as booleans (n,).
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
+        max_distance : float or (n,) array_like
+            Not negative.
 
         Raises
         ------
@@ -202,12 +240,12 @@ class Sphere:
         return np.isfinite(t) & (t < limit)
 
     def _distance(self, offset: Float, d: Float) -> Float:
-        """Distance (n,) to the nearest hit, infinite for a miss; `offset` is origin - centre.
+        """Return the distance (n,) to the nearest hit, infinite for a miss.
 
-        The discriminant is taken from the ray's nearest point to the centre and the smaller root
-        from the product of the roots: Haines et al., "Precision Improvements for Ray/Sphere
-        Intersection", Ray Tracing Gems (2019), chapter 7. The textbook formula loses all digits
-        when the sphere is small or far away.
+        `offset` is origin - centre. The discriminant is computed from the ray's nearest point to
+        the centre, and the smaller root from the product of the roots: Haines et al., "Precision
+        Improvements for Ray/Sphere Intersection", Ray Tracing Gems (2019), chapter 7. The textbook
+        formula loses all digits when the sphere is small or far away.
         """
         along = -dots(offset, d)
         nearest = offset + along[:, None] * d
@@ -224,7 +262,7 @@ class Sphere:
 
 
 def sphere(radius: float = 1.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Sphere:
-    """A sphere, intersected in closed form.
+    """Return a sphere, which is intersected in closed form.
 
     Parameters
     ----------
@@ -253,9 +291,9 @@ def sphere(radius: float = 1.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Sphere:
 class Mesh:
     """Triangles with smooth normals and named parts, intersected with Embree.
 
-    Embree works in float32, so it sees the mesh scaled to unit radius about its centre and rays
-    that start near it; hits are then placed on the float64 triangle by their barycentric
-    coordinates. Sizes from 1e-6 to 1e6 and viewers 1e6 radii away work alike.
+    Embree works in float32. So it gets the mesh scaled to unit radius about its centre, and rays
+    that start near it; the barycentric coordinates of a hit then give the point on the float64
+    triangle. Sizes from 1e-6 to 1e6 and viewers 1e6 radii away work alike.
 
     Parameters
     ----------
@@ -264,7 +302,7 @@ class Mesh:
     faces : (F, 3) array_like of int
         Vertex indices. Triangles without area are dropped.
     normals : (V, 3) or (F, 3, 3) array_like
-        Outward normals of the vertices, or of each face's corners; scaled to unit length.
+        Outward normals of the vertices, or of each face's corners; they are normalised.
     face_part : (F,) array_like of int
         Index into `parts` of each face.
     parts : sequence of str
@@ -275,7 +313,7 @@ class Mesh:
     Attributes
     ----------
     vertices, faces, normals, face_part, parts, uvs
-        As given, less the dropped faces; read-only arrays. They build an equal mesh again.
+        As given, without the dropped faces; read-only arrays that build an equal mesh again.
     center : (3,) float64 array
         Centre of the bounding box, and of the bounding sphere.
     radius : float
@@ -315,7 +353,7 @@ class Mesh:
         keep = np.sqrt(dots(area, area)) > 1e-12 * longest
         if not keep.any():
             raise ValueError(f"faces: expected triangles with an area, got {len(f)} without")
-        # stray vertices and triangles that were dropped must not blow up the bounding sphere
+        # unused vertices and dropped triangles must not enlarge the bounding sphere
         self.center: Float
         self.radius: float
         used, _ = _used(v, f[keep])
@@ -327,8 +365,8 @@ class Mesh:
         self.normals: Float = to_unit(n if n.ndim == 2 else n[keep])
         self.face_part: Int = p[keep].astype(np.int32)
         self.uvs: Float | None = uv[keep] if uv is not None and uv.ndim == 3 else uv
-        # a file's winding may disagree with its normals: where they clearly do (a coarse, strongly
-        # curved triangle may seem to a little) the normals say which side is out
+        # a file's winding may disagree with its normals: where it clearly does, the normals
+        # decide which side is outside (coarse, strongly curved triangles may disagree a little)
         facet = to_unit(area[keep])
         mean = self._corner_normals(np.arange(len(facet))).mean(axis=1)
         against = dots(facet, mean) < -0.5
@@ -339,7 +377,7 @@ class Mesh:
             self.uvs.flags.writeable = False
 
     def __reduce__(self) -> tuple[type[Mesh], tuple[object, ...]]:
-        # Embree's scene cannot be pickled or copied: build it again
+        # Embree's scene cannot be pickled or copied, so it is built again
         given = (self.vertices, self.faces, self.normals, self.face_part, self.parts, self.uvs)
         return Mesh, given
 
@@ -347,11 +385,17 @@ class Mesh:
         return f"Mesh({len(self.faces)} triangles, parts={self.parts!r})"
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Nearest hits of rays from `origins` (n, 3) or (3,) along unit `directions` (n, 3).
+        """Return the nearest hits of rays.
 
-        The shading normal is interpolated over the triangle, turned round where the surface is
-        seen from behind, and bent towards the viewer where it would make a cosine below
-        `MIN_COSINE` with the direction to the viewer, as it does along silhouettes.
+        The shading normal is interpolated over the triangle and flipped where the surface is seen
+        from behind. Where its cosine with the direction to the viewer would be below `MIN_COSINE`,
+        as along silhouettes, it is bent towards the viewer.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
 
         Raises
         ------
@@ -375,7 +419,7 @@ class Mesh:
         point = np.einsum("nc,nck->nk", weight, corners)
         smooth = np.einsum("nc,nck->nk", weight, corner_normals)
         facet, wo = self._facet[face], -d[hit]
-        # the triangle tells which side is seen: at silhouettes the smooth normal alone does not
+        # the triangle decides which side is visible; at silhouettes the smooth normal may err
         side = np.where(dots(facet, wo) < 0.0, -1.0, 1.0)
         position[hit] = point
         normal[hit] = _facing_normal(smooth, facet, side, wo)
@@ -391,9 +435,17 @@ class Mesh:
     def occluded(
         self, origins: ArrayLike, directions: ArrayLike, max_distance: ArrayLike = math.inf
     ) -> Bool:
-        """Whether rays (n, 3) meet the mesh before `max_distance`, a number or (n,).
+        """Return whether rays meet the mesh before `max_distance`, as booleans (n,).
 
-        An origin on the surface meets the surface: start at `Hits.start`.
+        A ray that starts on the surface meets the surface: start at `Hits.start`.
+
+        Parameters
+        ----------
+        origins : (n, 3) or (3,) array_like
+        directions : (n, 3) array_like
+            Unit vectors.
+        max_distance : float or (n,) array_like
+            Not negative.
 
         Raises
         ------
@@ -403,7 +455,7 @@ class Mesh:
         o, d = _as_rays(origins, directions)
         limit = _as_distances(max_distance, len(d))
         start, skipped = self._approach(o, d)
-        # nothing lies further off than the bounding sphere is wide; this also keeps float32 happy
+        # the mesh is nowhere further away than this, and float32 can represent it
         reach = np.minimum(limit / self.radius - skipped, 8.0)
         found = self._embree.run(
             start,
@@ -415,7 +467,7 @@ class Mesh:
         return blocked
 
     def _approach(self, o: Float, d: Float) -> tuple[NDArray[np.float32], Float]:
-        """Local float32 origins (n, 3), and by how many radii (n,) each was moved along its ray.
+        """Return local float32 origins (n, 3), and by how many radii (n,) each moved along its ray.
 
         A distant origin moves up to the bounding sphere: in float32 a ray from 1000 radii away
         would miss its target by 1e-4 radii.
@@ -426,42 +478,42 @@ class Mesh:
         if len(distant):
             a, b = local[distant], d[distant]
             step = np.maximum(-dots(a, b) - 1.5, 0.0)
-            # a ray that passes far outside may still be anywhere: keep it within float32
+            # a ray that passes far outside may start anywhere: keep it within float32
             local[distant] = np.clip(a + step[:, None] * b, -1e30, 1e30)
             skipped[distant] = step
         return local.astype(np.float32), skipped
 
     def _corner_normals(self, face: NDArray[np.integer]) -> Float:
-        """Unit normals (n, 3, 3) of the corners of faces (n,)."""
+        """Return unit normals (n, 3, 3) of the corners of faces (n,)."""
         index = self.faces[face] if self.normals.ndim == 2 else face
         corner: Float = self.normals[index]
         return corner
 
     @functools.cached_property
     def convex(self) -> bool:
-        """True where the mesh is closed and convex for certain, and not too large to tell."""
+        """Whether the mesh is certainly closed and convex; False if it is too large to test."""
         return len(self.faces) <= _CONVEX_FACES and _is_convex(self._local, self.faces)
 
     @functools.cached_property
     def _embree(self) -> embreex.rtcore_scene.EmbreeScene:
-        # robust: rays through a shared edge hit one of its two triangles and never slip between
+        # robust: a ray through a shared edge hits one of its two triangles
         scene = embreex.rtcore_scene.EmbreeScene(robust=True)
         embreex.mesh_construction.TriangleMesh(scene, self._local.astype(np.float32), self.faces)
         return scene
 
 
 def _used(points: Float, faces: NDArray[np.integer]) -> tuple[Float, NDArray[np.integer]]:
-    """Those of points (V, 3) that faces (F, 3) use, in order, and the faces' indices among them."""
+    """Return the points (V, 3) that faces (F, 3) use, and the faces' indices among them."""
     mask = np.zeros(len(points), dtype=bool)
     mask[faces] = True
     return points[mask], (np.cumsum(mask) - 1)[faces]
 
 
 def _bounds(points: Float) -> tuple[Float, float]:
-    """Centre (3,) of the bounding box of points (n, 3), and the radius about it."""
+    """Return the centre (3,) of the bounding box of points (n, 3), and the radius about it."""
     low, high = points.min(axis=0), points.max(axis=0)
     center: Float = 0.5 * low + 0.5 * high
-    with np.errstate(over="ignore"):  # an infinite size is refused next
+    with np.errstate(over="ignore"):  # the test below rejects an infinite size
         offset = points - center
         radius = float(np.sqrt(dots(offset, offset).max()))
     if not (math.isfinite(radius) and radius > 0.0):
@@ -499,7 +551,7 @@ def _check_mesh(
 
 
 def _checked_uvs(uvs: ArrayLike, vertices: int, faces: int) -> Float:
-    """Texture coordinates as float64, (V, 2) or (F, 3, 2); ValueError where they do not fit."""
+    """Return texture coordinates as float64, (V, 2) or (F, 3, 2); ValueError if they do not fit."""
     uv = np.array(uvs, dtype=np.float64)
     if uv.shape not in ((vertices, 2), (faces, 3, 2)):
         raise ValueError(f"uvs: expected shape {(vertices, 2)} or {(faces, 3, 2)}, got {uv.shape}")
@@ -509,14 +561,15 @@ def _checked_uvs(uvs: ArrayLike, vertices: int, faces: int) -> Float:
 
 
 def _is_convex(points: Float, faces: NDArray[np.integer]) -> bool:
-    """Whether triangles (F, 3) of points (V, 3), at most 1 from their centre, bound a convex body.
+    """Return whether triangles (F, 3) of points (V, 3) bound a convex body.
 
-    Closed: each edge has two triangles. No edge bends inwards. And the body is all of its convex
-    hull: a surface that bends outwards everywhere may still wind round twice or be in two pieces,
-    and bends too small to count may add up. Neither winding nor normals matter.
+    The points are at most 1 from their centre. Three things are tested. The surface is closed: each
+    edge has two triangles. No edge bends inwards. And the volume is that of the convex hull,
+    because a surface that bends outwards everywhere may still wind round twice or be in two pieces,
+    and many tiny bends may add up. Neither winding nor normals matter.
     """
     points, faces = _used(points, faces)
-    # most shapes have points on both sides of one of a few planes: so much for them
+    # a cheap first test: most shapes have points on both sides of one of a few planes
     few = points[faces[:: len(faces) // 16 + 1]]
     planes = to_unit(np.cross(few[:, 1] - few[:, 0], few[:, 2] - few[:, 0]))
     height = points @ planes.T - dots(planes, few[:, 0])
@@ -525,7 +578,7 @@ def _is_convex(points: Float, faces: NDArray[np.integer]) -> bool:
     corners = points[faces]
     double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.sqrt(dots(double, double))
-    # the surface's centroid is well inside; that of its corners may crowd at one side
+    # the centroid of the surface is well inside; that of its corners may be near one side
     inner = np.average(corners.mean(axis=1), axis=0, weights=area)
     normal = to_unit(double)
     offset = dots(normal, corners[:, 0] - inner)
@@ -539,12 +592,12 @@ def _is_convex(points: Float, faces: NDArray[np.integer]) -> bool:
     one, other = order[0::2], order[1::2]
     if len(edge) % 2 or (edge[one] != edge[other]).any():
         return False
-    facing = welded[np.roll(corner, 1, axis=1).ravel()] - inner  # the corner across from each edge
+    facing = welded[np.roll(corner, 1, axis=1).ravel()] - inner  # the corner opposite each edge
     height = dots(facing[other], normal[one // 3]) - offset[one // 3]
     if height.max() > _CONVEX_HEIGHT:
         return False
     volume = float(np.sum(area * offset)) / 3.0
-    import scipy.spatial  # slow to import, and few shapes come so far
+    import scipy.spatial  # slow to import, and few shapes reach this test
 
     try:
         hull = float(scipy.spatial.ConvexHull(welded).volume)
@@ -554,7 +607,7 @@ def _is_convex(points: Float, faces: NDArray[np.integer]) -> bool:
 
 
 def _facing_normal(smooth: Float, facet: Float, side: Float, wo: Float) -> Float:
-    """Shading normals (n, 3) that face the viewer, by a cosine of at least `MIN_COSINE`.
+    """Return shading normals (n, 3) that face the viewer, with a cosine of at least `MIN_COSINE`.
 
     Parameters
     ----------
@@ -563,7 +616,7 @@ def _facing_normal(smooth: Float, facet: Float, side: Float, wo: Float) -> Float
     facet : (n, 3) array
         Unit outward normals of the triangles.
     side : (n,) array
-        1 where the triangle's outer side is seen, -1 where its inner.
+        1 where the triangle's outer side is visible, -1 where its inner side is.
     wo : (n, 3) array
         Unit directions to the viewer.
     """
@@ -573,9 +626,9 @@ def _facing_normal(smooth: Float, facet: Float, side: Float, wo: Float) -> Float
     if len(low):
         w = wo[low]
         tangent = normal[low] - dots(normal[low], w)[:, None] * w
-        opposite = dots(tangent, tangent) < 1e-24  # looks straight away: any tangent will do
+        opposite = dots(tangent, tangent) < 1e-24  # points straight away: take any tangent
         tangent = to_unit(np.where(opposite[:, None], shading_frame(w)[0], tangent))
-        cosine = MIN_COSINE * (1.0 + 1e-9)  # a hair above, so that rounding stays above too
+        cosine = MIN_COSINE * (1.0 + 1e-9)  # slightly more, so that rounding cannot go below
         normal[low] = cosine * w + math.sqrt(1.0 - cosine**2) * tangent
     return normal
 
@@ -583,12 +636,12 @@ def _facing_normal(smooth: Float, facet: Float, side: Float, wo: Float) -> Float
 def _smooth_lift(
     point: Float, weight: Float, corners: Float, normals: Float, facet: Float, side: Float
 ) -> Float:
-    """Offsets (n, 3) from points on triangles to the smooth surface that their normals tell of.
+    """Return offsets (n, 3) from points on triangles to the smooth surface implied by the normals.
 
-    Without them a surface lit at a grazing angle would lie in the shadow of its own coarse
-    triangles: Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II (2021). A point goes to
-    the mean, by its barycentric weights, of its projections on the corners' tangent planes. Flat
-    and hollow triangles are left alone.
+    Without them a surface lit at a grazing angle would be in the shadow of its own coarse
+    triangles: Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II (2021). A point moves to
+    the mean, weighted by its barycentric coordinates, of its projections onto the corners' tangent
+    planes. Flat and concave triangles are not changed.
 
     Parameters
     ----------
@@ -599,12 +652,12 @@ def _smooth_lift(
     corners, normals : (n, 3, 3) arrays
         Positions and unit outward normals of the corners.
     side : (n,) array
-        1 where the triangle's outer side is seen, -1 where its inner.
+        1 where the triangle's outer side is visible, -1 where its inner side is.
     """
     height = np.einsum("nck,nck->nc", point[:, None, :] - corners, normals)
-    # seen from inside, what bulges is hollow
+    # seen from inside, a convex surface is concave
     depth = np.minimum(side[:, None] * height, 0.0)
     lift = -np.einsum("nc,nck->nk", side[:, None] * weight * depth, normals)
-    # normals that contradict their triangle must not sink the point
+    # normals that contradict their triangle must not move the point inwards
     outwards = side * dots(lift, facet) > 0.0
     return np.where(outwards[:, None], lift, 0.0)

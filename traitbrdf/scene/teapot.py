@@ -1,17 +1,14 @@
-"""The teapot, from its published Bezier patches."""
+"""The Utah teapot, from its published Bezier patches."""
 
 from __future__ import annotations
 
 import functools
 import json
 from importlib import resources
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    pass
 from traitbrdf.scene.shapes import Mesh, dots, to_unit
 
 Float = NDArray[np.float64]
@@ -20,12 +17,12 @@ Float = NDArray[np.float64]
 
 
 def teapot(resolution: int = 24) -> Mesh:
-    """The Utah teapot, y up, handle at -x and spout at +x, 3.15 high.
+    """Return the Utah teapot: y up, handle at -x and spout at +x, 3.15 high.
 
-    Newell's 32 bicubic Bezier patches (1975, with the bottom added later) in the parts rim,
-    body, handle, spout, lid and bottom. Normals are those of the patches themselves, not of the
-    triangles. The surface is open: a slit runs round under the lid's brim and the spout has a
-    mouth, through which the inner side shows. Repeated calls return the same mesh.
+    The mesh is Newell's 32 bicubic Bezier patches (1975, with the bottom added later) in the parts
+    rim, body, handle, spout, lid and bottom. Normals are those of the patches, not of the
+    triangles. The surface is open: there is a slit under the lid's brim, and through the mouth of
+    the spout the inner side is visible. Repeated calls return the same mesh.
 
     Parameters
     ----------
@@ -66,10 +63,10 @@ def _teapot(resolution: int) -> Mesh:
 
 
 def _evaluate_patches(control: Float, resolution: int) -> tuple[Float, Float]:
-    """Points and unit outward normals (P, n+1, n+1, 3) of bicubic patches (P, 4, 4, 3).
+    """Return points and unit outward normals (P, n+1, n+1, 3) of bicubic patches (P, 4, 4, 3).
 
-    The sums are written so that a boundary curve comes out bit for bit the same from either end:
-    neighbouring patches share their edges exactly and no crack opens between them.
+    The sums are ordered so that a boundary curve is bit for bit the same from either end. So
+    neighbouring patches share their edges exactly, and no crack opens between them.
     """
     t = np.arange(resolution + 1) / resolution
     s = t[::-1]
@@ -79,7 +76,7 @@ def _evaluate_patches(control: Float, resolution: int) -> tuple[Float, Float]:
     )
 
     def blend(basis: Float, points: Float) -> Float:
-        """Contract the second axis of `points` (P, 4, ..., 3); its place goes last but one."""
+        """Contract the second axis of `points` (P, 4, ..., 3); the new axis is last but one."""
         terms = [points[:, i, ..., None, :] * basis[i][:, None] for i in range(4)]
         total: Float = (terms[0] + terms[3]) + (terms[1] + terms[2])
         return total
@@ -88,9 +85,9 @@ def _evaluate_patches(control: Float, resolution: int) -> tuple[Float, Float]:
     along, along_du = blend(value, control), blend(slope, control)
     position = blend(value, along)
     du, dv, dudv = blend(value, along_du), blend(slope, along), blend(slope, along_du)
-    normal = np.cross(dv, du)  # Newell's patches have du x dv pointing inwards
-    # where an edge shrinks to a point (the lid's top, the bottom's centre) its derivative along
-    # itself vanishes and grows inwards at the rate of the mixed one: take the limit
+    normal = np.cross(dv, du)  # on Newell's patches du x dv points inwards
+    # where an edge degenerates to a point (the lid's top, the bottom's centre) the derivative
+    # along it vanishes; next to the point it is proportional to the mixed one: take the limit
     inwards = np.where(t < 0.5, 1.0, -1.0)[:, None]
     scale = 1e-12 * np.abs(control).max() ** 2
     flat = dots(normal, normal) < scale**2

@@ -130,10 +130,10 @@ def keep(
     chosen = int(good[0]) if len(good) else len(ranks) - 1
     while True:
         used = transport if ranks[chosen] == most else transport.truncated(ranks[chosen])
-        seconds = _median_seconds(frame, used)
+        seconds = median_seconds(frame, used)
         if error is None or error >= ROUNDING:
             half = used.stored(torch.float16)
-            faster = _median_seconds(frame, half)
+            faster = median_seconds(frame, half)
             if faster < WORTH * seconds:
                 used, seconds = half, faster
         if fps is None or seconds <= RESERVE / fps or chosen == 0:
@@ -148,7 +148,7 @@ def keep(
     return used, promise
 
 
-def _median_seconds(frame: Callable[[Transport], object], transport: Transport) -> float:
+def median_seconds(frame: Callable[[Transport], object], transport: Transport) -> float:
     """Of five frames, after one that does not count."""
     frame(transport)
     times = []

@@ -23,7 +23,6 @@ from traitbrdf.formats.files import (
 )
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import Mesh, Sphere
-from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
 
 Float32 = NDArray[np.float32]
@@ -35,14 +34,6 @@ _CACHE_FORMAT = 2
 
 _COMPUTES = ("formats", "reflectance", "scene", "space", "transport", "session")
 """Rooms whose code a preparation depends on."""
-
-
-def fingerprint(embedding: BRDFEmbedding) -> str:
-    digest = hashlib.sha256()
-    for name, value in sorted(embedding.arrays().items()):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    return digest.hexdigest()[:16]
 
 
 def _hash(*values: object) -> str:
@@ -82,7 +73,7 @@ def cache_key(
     else:
         return None  # what casts shadows is known to the shape alone
     return _hash(
-        _CACHE_FORMAT, _code(), fingerprint(library.embedding), library.coordinates,
+        _CACHE_FORMAT, _code(), library.embedding.fingerprint(), library.coordinates,
         rank, resolution, seed, scene.height, scene.width, scene.parts, scene.casts,
         scene.ground, scene.shadows, np.asarray(shape.center), shape.radius, shape.lowest,
         *geometry, scene.environment.image, scene.environment.rotation, scene.lights,
@@ -137,12 +128,12 @@ class Cache:
             return None
         return cls(folder, limit) if folder.is_absolute() else None
 
-    def _file(self, key: str) -> Path:
+    def file(self, key: str) -> Path:
         return self.folder / f"{key}.npz"
 
     def read(self, key: str) -> dict[str, NDArray[Any]] | None:
         """The arrays of a key; None where there are none, or none that are whole."""
-        path = self._file(key)
+        path = self.file(key)
         try:
             arrays = read_arrays(path)
         except FileNotFoundError:
@@ -156,7 +147,7 @@ class Cache:
 
     def drop(self, key: str) -> None:
         with contextlib.suppress(OSError):
-            self._file(key).unlink(missing_ok=True)
+            self.file(key).unlink(missing_ok=True)
 
     def write_behind(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write in a thread of its own, so that the first frame need not wait.
@@ -174,7 +165,7 @@ class Cache:
             return
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with atomic_path(self._file(key)) as temporary, temporary.open("wb") as file:
+            with atomic_path(self.file(key)) as temporary, temporary.open("wb") as file:
                 # compressing takes as long as preparing anew
                 np.savez(file, **arrays)  # type: ignore[arg-type]
             self._trim()

@@ -34,7 +34,7 @@ class Canvas:
         self._patches: dict[int | None, tuple[torch.Tensor, list[Any]]] = {}
         self.drawn: list[PartFrame] = []
         self._free: list[_Page] = []
-        self._image = self._backdrop
+        self.pixels = self._backdrop
         self.changed: list[int] = []
 
     def draw(self, frames: list[PartFrame]) -> None:
@@ -46,7 +46,7 @@ class Canvas:
             self.redraw(self.changed, frames)
         else:
             self.changed = list(range(len(frames)))
-            self._image = self._transport.compose(frames).reshape(-1, 3)
+            self.pixels = self._transport.compose(frames).reshape(-1, 3)
         self.drawn = frames
 
     def redraw(self, changed: list[int], frames: list[PartFrame]) -> None:
@@ -54,13 +54,13 @@ class Canvas:
         for i in changed:
             part = self._transport.parts[i]
             if part is not None:
-                self._image.index_copy_(0, part.pixels, frames[i].radiance)
+                self.pixels.index_copy_(0, part.pixels, frames[i].radiance)
         if changed:
             pixels, places = self._patch(changed[0] if len(changed) == 1 else None)
             sums = self._backdrop[pixels]
             for i, fragments, place in places:
                 sums.index_add_(0, place, frames[i].radiance[fragments])
-            self._image.index_copy_(0, pixels, sums)
+            self.pixels.index_copy_(0, pixels, sums)
 
     def _patch(self, part: int | None) -> tuple[torch.Tensor, list[Any]]:
         """Pixels that are sums and show `part` (None: any), and what falls on which of them."""
@@ -90,7 +90,7 @@ class Canvas:
         copy = np.asarray(page)
         # whatever views of it there are hold the array itself: once that is gone, all are
         weakref.finalize(copy, _give_back, self._free, page).atexit = False
-        copy[...] = self._image.cpu().numpy().reshape(copy.shape)
+        copy[...] = self.pixels.cpu().numpy().reshape(copy.shape)
         return copy
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.preparation import Preparation, Prepared
@@ -26,51 +24,17 @@ FRAMES_KEPT = 1 << 27
 
 
 @dataclass(frozen=True)
-class Said:
-    """The call that did an edit.
-
-    A stroke lies on the image: where the picture has been framed anew since, `anywhere` says the
-    same part by part. It is put into words when it is asked for: while it is painted, nobody does.
-    """
-
-    call: str | Callable[[], str]
-    anywhere: str = ""
-    framing: tuple[Camera, int, int] | None = None
-
-    def under(self, framing: tuple[Camera, int, int]) -> str:
-        if self.anywhere and framing != self.framing:
-            return self.anywhere
-        return self.call if isinstance(self.call, str) else self.call()
-
-
-def move_call(
-    part: str | list[str],
-    amounts: Mapping[str, float],
-    hold: tuple[str, ...] | None,
-    photoreal: bool = True,
-) -> str:
-    said = "".join(f", {name}={float(value)!r}" for name, value in amounts.items())
-    held = "" if hold is None else f", hold={hold!r}"
-    freely = "" if photoreal else ", photoreal=False"
-    return f"edit.move({part!r}{said}{held}{freely})"
-
-
-@dataclass(frozen=True)
-class Edit:
-    """One undoable step: the materials before and after, and the call that did it."""
-
-    before: dict[str, Material]
-    after: dict[str, Material]
-    said: Said
-
-
-@dataclass(frozen=True)
 class Shown:
     """One part's shading as it is shown, how it was made, and what that took."""
 
     frame: PartFrame
     tier: Literal["basis", "trained", "exact"]
     seconds: float
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of its radiance."""
+        return self.frame.radiance.numel() * self.frame.radiance.element_size()
 
 
 class Drafted(NamedTuple):
@@ -104,26 +68,17 @@ class View:
     def keep(self, index: int, material: Material, shown: Shown) -> None:
         """Keep a part's shading, the least recently used ones going first."""
         old = self.kept.pop((index, material), None)
-        self.kept_bytes -= 0 if old is None else _size(old)
+        self.kept_bytes -= 0 if old is None else old.bytes
         self.kept[index, material] = shown
-        self.kept_bytes += _size(shown)
+        self.kept_bytes += shown.bytes
         while self.kept_bytes > FRAMES_KEPT and len(self.kept) > len(self.scene.parts):
             _, old = self.kept.popitem(last=False)
-            self.kept_bytes -= _size(old)
-
-
-def _size(shown: Shown) -> int:
-    return shown.frame.radiance.numel() * shown.frame.radiance.element_size()
+            self.kept_bytes -= old.bytes
 
 
 def measured(view: View, transport: Transport) -> float:
     """Error of the frame that was shown last."""
     return transport.frame_error([one.frame for one in view.shown])
-
-
-def framing_of(scene: Scene) -> tuple[Camera, int, int]:
-    """Where on the image things lie."""
-    return scene.camera, scene.height, scene.width
 
 
 def enlarged(image: Float32, height: int, width: int) -> Float32:

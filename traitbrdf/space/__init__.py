@@ -1,1 +1,1 @@
-"""Materials as points: the library, its embedding, traits and moves."""
+"""Materials as points of a space: library, embedding, traits and moves."""

@@ -1,20 +1,21 @@
 """The embedding: BRDFs as points of a low-dimensional space (after Matusik et al. 2003).
 
 A table's values are mapped by y = log(f + FLOOR). Matusik et al. ("A Data-Driven Reflectance
-Model", SIGGRAPH 2003) take one vector of all colours for each material; here the mean of the three
+Model", SIGGRAPH 2003) take one vector of all colours for each material. Here the mean of the three
 channels' logarithms and their differences (red against blue, green against magenta) are embedded
-apart, by two PCAs: materials differ in many ways in shape and in few in colour. With m = (16, 4)
-components a material has k = 24 coordinates: 16 achromatic ones first, then 4 for red against blue,
-then 4 for green against magenta; each axis is scaled to unit variance.
+separately, by two PCAs: materials differ in many ways in shape and in few in colour. With
+m = (16, 4) components a material has k = 24 coordinates: 16 achromatic ones first, then 4 for red
+against blue, then 4 for green against magenta; each axis is scaled to unit variance.
 
-The components that PCA finds are then found anew with weights that follow the light which a cell
-reflects (weighted low-rank approximation): what is off where nothing is seen counts little. What a
-linear space holds that no material does, holes in highlights and spikes, is mended where it is
-decoded (`profiles`).
+The principal components are then refined with weights that follow the light which a cell reflects
+(weighted low-rank approximation), since errors that nobody sees matter little. A linear space also
+holds tables that no material has, with holes in highlights and spikes; decoding corrects them
+(`traitbrdf.space.highlights`).
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -34,16 +35,17 @@ from traitbrdf.reflectance.brdf import (
     TabulatedBRDF,
     albedo_operator,
 )
+from traitbrdf.space.fitting import batches, checked_grid, fit_weight, principal_axes
 from traitbrdf.space.highlights import Profiles
 
-if TYPE_CHECKING:  # where it is needed it is imported: it takes a second
+if TYPE_CHECKING:  # importing torch takes a second: functions that need it import it
     import torch
 from traitbrdf.space.logmap import (
     FLOOR,
     OPPONENT,
     cell_weight,
     channel_logs,
-    exposure,
+    channel_mixing,
     log_map,
     log_slope,
     natural_light,
@@ -60,32 +62,27 @@ GRID = HalfDiffGrid(90, 24, 9, "folded")
 """The grid on which the library lives and frames are decoded."""
 
 _MARGIN = 1.0 + 1e-6
-"""What scaled tables stay below albedo 1 by, so that rounding does not lift them above it."""
-
-_BATCH = 128
-"""Materials that are held in memory at once while fitting."""
+"""Factor that keeps scaled tables below albedo 1 in spite of rounding."""
 
 _NOISE = 0.1
-"""Assumed deviation of log f from the manifold, where samples are encoded."""
+"""Assumed standard deviation of log f from the space, where samples are encoded."""
 
 _SEEN = 8e-4
-"""Assumed deviation of what is seen, relative to all of it, under light as it is found."""
-
-_ENERGY = 0.9
-"""How much the light that a cell reflects counts when a library is fitted; the rest is even."""
+"""Assumed standard deviation of visible radiance, relative to all of it, under natural light."""
 
 _PASSES = 2
-"""How often the components are found anew with these weights."""
+"""How often the components are refined with these weights."""
 
 _ROUNDS = 25
-"""At most so many times are the weights of samples found anew."""
+"""Greatest number of rounds in which the weights of samples are recomputed."""
 
 _ROBUST = 0.03
-"""Deviation of log f beyond which a sample counts less, as the inverse of it: what is nearly the
-least sum of absolute deviations follows most samples, not the worst."""
+"""Deviation of log f beyond which a sample's weight falls with its inverse: nearly the least sum of
+absolute deviations, which follows most samples rather than the worst.
+"""
 
 _PRIOR = 0.01
-"""Precision of the library's spread, where a point is refined: next to nothing."""
+"""Precision of the prior (the library's unit variance) where a point is refined: nearly none."""
 
 
 class _Tensors(NamedTuple):
@@ -111,14 +108,24 @@ class BRDFEmbedding:
     Attributes
     ----------
     grid_ : HalfDiffGrid
-    mean_ : (cells,) float32, mean of log(f + FLOOR)
-    components_ : (cells, m) float32, those of the mean of the channels first
+    mean_ : (cells,) float32
+        Mean of log(f + FLOOR).
+    components_ : (cells, m) float32
+        Those of the mean of the channels first.
     weight_ : (cells,) float32
-        What a cell counts beside its light: the square root of the lower cosine, 0 below the
+        Weight of a cell apart from its light: the square root of the lower cosine, 0 below the
         horizon.
     low_, high_ : (k,) float64
         The gamut box: the range of the library's coordinates.
-    explained_variance_ratio_ : (m,) float64, of the whole variance, before the weights
+    profiles_ : Profiles
+        How decoding corrects log f along theta_h.
+    explained_variance_ratio_ : (m,) float64
+        Of the whole variance, before the weights.
+
+    Raises
+    ------
+    ValueError
+        If `n_components` is not one or two positive integers.
     """
 
     def __init__(self, n_components: int | tuple[int, int] = (16, 4)) -> None:
@@ -133,26 +140,26 @@ class BRDFEmbedding:
                 f"n_components: expected one or two positive integers, got {n_components!r}"
             )
         self.n_components = (int(pair[0]), int(pair[1]))
-        self._mixing = _mixing(self.n_components)
+        self._mixing = channel_mixing(self.n_components)
 
     def fit(self, tables: Iterable[TabulatedBRDF]) -> BRDFEmbedding:
-        """Fit to a library of at least two tables on one grid; returns self.
+        """Fit to a library of at least two tables on one grid, and return self.
 
         Parameters
         ----------
         tables : iterable of TabulatedBRDF
-            Anything but an iterator may be larger than memory: it is gone through eleven times, and
-            128 tables are held at once.
+            May be larger than memory unless it is an iterator: it is read eleven times, and 128
+            tables are held at once.
 
         Raises
         ------
         ValueError
-            If there are too few tables, of several grids, or too alike.
+            If there are too few tables, tables of several grids, or tables that are too alike.
         """
         if isinstance(tables, Iterator):
             tables = list(tables)
         self.__dict__.pop("components_", None)  # a fit that fails leaves none
-        self.grid_, count = _checked_grid(tables)
+        self.grid_, count = checked_grid(tables)
         achromatic, chromatic = self.n_components
         if count <= max(achromatic, chromatic):
             raise ValueError(
@@ -161,25 +168,25 @@ class BRDFEmbedding:
             )
         self.weight_ = cell_weight(self.grid_)
         total = np.zeros(self.grid_.size)
-        for logs in _batches(tables):
+        for logs in batches(tables):
             total += logs.sum(axis=(0, 1))
         self.mean_ = (total / (3 * count)).astype(np.float32)
-        grey = self._axes(tables, slice(0, 1), achromatic, count)
-        # both signs: the mean is grey, whatever colours the library prefers
-        colour = self._axes(tables, slice(1, 3), chromatic, count)
+        grey = principal_axes(tables, slice(0, 1), achromatic, count, self.mean_, self.weight_)
+        # with both signs, so that the mean is grey whatever colours the library prefers
+        colour = principal_axes(tables, slice(1, 3), chromatic, count, self.mean_, self.weight_)
         self.components_ = np.concatenate([grey[0], colour[0]], axis=1)
         variance = np.concatenate([grey[1], 2.0 * colour[1]])
         self.explained_variance_ratio_ = variance / (grey[2] + 2.0 * colour[2])
         for _ in range(_PASSES):
             self._reweighted(tables)
-        self._profiles = Profiles.of(lambda: _batches(tables), self.grid_)
+        self.profiles_ = Profiles.of(lambda: batches(tables), self.grid_)
         self._prepare()
-        coordinates = np.concatenate([self.least_squares(logs) for logs in _batches(tables)])
+        coordinates = np.concatenate([self.least_squares(logs) for logs in batches(tables)])
         self.low_, self.high_ = coordinates.min(axis=0), coordinates.max(axis=0)
         return self
 
     def _reweighted(self, tables: Iterable[TabulatedBRDF]) -> None:
-        """Components and mean found anew, by weights that follow the light which a cell reflects.
+        """Refine components and mean with weights that follow the light which a cell reflects.
 
         Weighted low-rank approximation by alternating least squares (Srebro & Jaakkola, "Weighted
         Low-Rank Approximations", ICML 2003, section 3).
@@ -191,13 +198,15 @@ class BRDFEmbedding:
         gram = torch.zeros((len(upper[0]), self.grid_.size), dtype=torch.float64)
         pull = torch.zeros((size, self.grid_.size), dtype=torch.float64)
         squares, count = np.zeros(self.size), 0
-        for logs in _batches(tables):
+        for logs in batches(tables):
             z = self.least_squares(logs)
             squares, count = squares + np.sum(z**2, axis=0), count + len(z)
             scores = np.einsum("cmk,nk->ncm", self._mixing, z)
             scores = np.concatenate([scores, np.ones((*scores.shape[:2], 1))], axis=2)
             rows = torch.from_numpy(scores.reshape(-1, size).astype(np.float32))
-            weight = torch.from_numpy(self._fit_weight(logs).reshape(len(rows), -1))
+            weight = torch.from_numpy(
+                fit_weight(logs, self.weight_, self.grid_).reshape(len(rows), -1)
+            )
             weight += 1e-8  # cells below the horizon are interpolated with, and so fitted too
             gram += (rows[:, upper[0]] * rows[:, upper[1]]).T @ weight
             weight *= torch.from_numpy(logs.reshape(len(rows), -1))
@@ -213,26 +222,28 @@ class BRDFEmbedding:
         self.components_ = np.ascontiguousarray(found[:, :-1], np.float32)
         self.mean_ = np.ascontiguousarray(found[:, -1], np.float32)
 
-    def _fit_weight(self, logs: Float32) -> Float32:
-        """(n, 3, cells) what the cells of log(f + FLOOR) count: each material 3 in all."""
-        even = self.weight_**2 / np.sum(self.weight_**2)
-        shown = np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0) * exposure(self.grid_)
-        shown *= 3.0 * _ENERGY / np.maximum(shown.sum(axis=(1, 2), keepdims=True), 1e-30)
-        shown += (1.0 - _ENERGY) * even
-        weight: Float32 = shown
-        return weight
-
     def least_squares(self, logs: Float32) -> Float64:
-        """Coordinates (n, k) of log(f + FLOOR) (n, 3, cells): the fit's own, and where `encode`
-        begins.
+        """Return the coordinates that fit uses, and where `encode` starts.
 
-        Weighted by the light that a cell reflects, neither robust nor clipped to the gamut.
+        Least squares with weights that follow the light which a cell reflects, neither robust nor
+        clipped to the gamut box.
+
+        Parameters
+        ----------
+        logs : (n, 3, cells) float32
+            log(f + FLOOR).
+
+        Returns
+        -------
+        (n, k) float64
         """
         import torch
 
         components = torch.from_numpy(self.components_)
         found = np.empty((len(logs), self.size))
-        for i, (weights, target) in enumerate(zip(self._fit_weight(logs), logs, strict=True)):
+        for i, (weights, target) in enumerate(
+            zip(fit_weight(logs, self.weight_, self.grid_), logs, strict=True)
+        ):
             gram, pull = 1e-6 * np.eye(self.size), np.zeros(self.size)
             for mixing, weight, log in zip(self._mixing, weights, target, strict=True):
                 weighted = components.T * torch.from_numpy(weight)
@@ -241,48 +252,8 @@ class BRDFEmbedding:
             found[i] = np.linalg.solve(gram, pull)
         return found
 
-    def _axes(
-        self, tables: Iterable[TabulatedBRDF], axes: slice, count: int, materials: int
-    ) -> tuple[Float32, Float64, float]:
-        """Components (cells, count) of some of the three colour axes, their variances, and the
-        variance in all."""
-        from sklearn.decomposition import IncrementalPCA  # slow to import, and needed only here
-
-        offset = math.sqrt(3.0) * self.mean_ if axes.start == 0 else np.float32(0.0)
-
-        def rows() -> Iterator[Float32]:
-            for logs in _batches(tables):
-                turned = np.einsum("ac,ncx->nax", OPPONENT[axes].astype(np.float32), logs) - offset
-                yield turned.reshape(-1, logs.shape[2])
-
-        signs = 1 if axes.start == 0 else 2
-        some = min(materials, _BATCH) * (axes.stop - axes.start) * signs
-        pca = IncrementalPCA(min(4 * count + 16, some, self.grid_.size))
-        for batch in rows():
-            weighted = batch * self.weight_
-            with np.errstate(invalid="ignore", divide="ignore"):  # shares of no variance at all
-                pca.partial_fit(np.concatenate([weighted, -weighted]) if signs == 2 else weighted)
-        variance = np.asarray(pca.explained_variance_[:count], np.float64)
-        deviation = np.sqrt(variance)
-        if deviation.min() <= 1e-5 * max(1.0, float(deviation.max())):
-            raise ValueError(
-                f"tables: expected at least {count + 1} different ones on every colour axis, "
-                f"got tables that span {int(np.sum(deviation > 1e-5))} dimensions of one"
-            )
-        # loadings by regression on the scores, so that cells below the horizon have them too
-        gram = np.zeros((count, count))
-        cross = np.zeros((count, self.grid_.size))
-        for batch in rows():
-            scores = (batch * self.weight_) @ pca.components_[:count].T / deviation
-            gram += scores.T @ scores
-            cross += scores.T @ batch
-        loadings = np.linalg.solve(gram, cross).T
-        total = float(np.sum(pca.var_))
-        shares = np.asarray(pca.explained_variance_ratio_[:count], np.float64)
-        return np.ascontiguousarray(loadings, np.float32), total * shares, total
-
     def _prepare(self) -> None:
-        """What follows from the fitted state: the basis as decoding reads it, the albedo check."""
+        """Derive from the fitted state the basis in decoding order and the albedo check."""
         self._basis = np.ascontiguousarray(self.components_.T)
         check = albedo_operator(self.grid_, ALBEDO_ANGLES).astype(np.float32)
         # three quarters of the cells count, so a dense product is faster than the sparse one
@@ -303,11 +274,20 @@ class BRDFEmbedding:
             raise ValueError("this BRDFEmbedding is not fitted yet: call fit(tables) first")
 
     def as_coordinates(self, z: ArrayLike) -> Float64:
-        """`z` as a finite (k,) array.
+        """Return `z` as an array, after checking it.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        (k,) float64
 
         Raises
         ------
         ValueError
+            If `z` is not k finite numbers.
         """
         self._fitted()
         value = np.asarray(z, np.float64)
@@ -318,7 +298,16 @@ class BRDFEmbedding:
         return value
 
     def encode(self, brdf: Reflectance) -> Float64:
-        """Coordinates (k,) of a table on any grid, or of a model, within the gamut box.
+        """Find coordinates of a table or a model, within the gamut box.
+
+        Parameters
+        ----------
+        brdf : Reflectance
+            A table on any grid, or a model.
+
+        Returns
+        -------
+        (k,) float64
 
         Raises
         ------
@@ -338,18 +327,19 @@ class BRDFEmbedding:
         return self._refined(self.clip(self.least_squares(logs[None])[0]), logs, weight)
 
     def _refined(self, start: Float64, logs: Float32, weight: Float64) -> Float64:
-        """The point of the gamut that shows log(f + FLOOR) (3, cells) best, from a near one.
+        """Return the point of the gamut box that best shows a table, starting near by.
 
-        What is made least: deviations of log f, by `weight` (3, cells) and robust (`_ROBUST`); and
-        deviations of what is seen under light as it is found (`natural_light`), relative to all
-        of it, by `_SEEN`. Levenberg and Marquardt's steps, within the box.
+        It minimises two costs: deviations of log(f + FLOOR) from `logs` (3, cells), robust
+        (`_ROBUST`) and with weights (3, cells); and squared deviations of visible radiance under
+        natural light (`natural_light`), relative to all of it, with deviation `_SEEN`.
+        Levenberg-Marquardt steps, within the box.
         """
         import torch
 
         light = natural_light(self.grid_)
         given = torch.from_numpy(np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0))
         seen = light @ given.T
-        black = light @ torch.full((self.grid_.size, 3), FLOOR)  # no more matters of what is black
+        black = light @ torch.full((self.grid_.size, 3), FLOOR)  # bounds the precision
         precision = 1.0 / (_SEEN**2 * float((seen**2 + black**2).sum()))
 
         def misfit(z: Float64) -> tuple[float, Float32, Float32, Any]:
@@ -421,7 +411,7 @@ class BRDFEmbedding:
         rgb: ArrayLike,
         return_std: bool = False,
     ) -> Float64 | tuple[Float64, Float64]:
-        """Coordinates (k,) of scattered or masked measurements, within the gamut box.
+        """Find coordinates of scattered or masked measurements, within the gamut box.
 
         Parameters
         ----------
@@ -429,15 +419,21 @@ class BRDFEmbedding:
         rgb : (n, 3) array_like
             f_r in 1/sr without the cosine; rows that are negative or not finite are left out.
         return_std : bool
-            Also return the standard deviation (k,) of each coordinate: near 1 (the library's own)
-            where the samples say nothing of it.
+            Also return the standard deviation of each coordinate. It is near 1 (the library's own)
+            where the samples do not determine the coordinate.
+
+        Returns
+        -------
+        z : (k,) float64
+        std : (k,) float64
+            Only with `return_std`.
 
         Notes
         -----
-        Outliers among the samples count little: iteratively reweighted least squares, nearly the
-        least sum of absolute deviations of log f. A ridge whose prior is the library's unit
-        variance keeps what the samples do not determine near the mean; 0.1 is the assumed deviation
-        of log f from the manifold.
+        Iteratively reweighted least squares, nearly the least sum of absolute deviations of log f,
+        so that outliers have little influence. A ridge whose prior is the library's unit variance
+        keeps near the mean what the samples do not determine; 0.1 is the assumed standard deviation
+        of log f from the space.
 
         Raises
         ------
@@ -490,8 +486,11 @@ class BRDFEmbedding:
         return z, np.sqrt(np.diag(np.linalg.inv(gram)))
 
     def _spread(self, rest: Float64, theta_h: Float64, theta_d: Float64, phi_d: Float64) -> Float32:
-        """(3, cells) what samples say beside a first guess, of cells around them: fading away from
-        them, slowest along phi_d, and the median of fifteen so that outliers do not spread."""
+        """Return (3, cells) what samples add to a first guess, extended to the cells around them.
+
+        It fades with the distance, slowest along phi_d, and is the median of fifteen samples, so
+        that outliers do not spread.
+        """
 
         def place(h: Float64, d: Float64, p: Float64) -> Float64:
             along = np.sqrt(h.ravel() * 2.0 / math.pi) * 15.0, d.ravel() * 4.0, p.ravel()
@@ -508,27 +507,45 @@ class BRDFEmbedding:
         return np.ascontiguousarray(spread.T, np.float32)
 
     def clip(self, z: ArrayLike) -> Float64:
-        """The nearest point (k,) in the gamut box."""
+        """Return the nearest point in the gamut box.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        (k,) float64
+
+        Raises
+        ------
+        ValueError
+            If `z` is not k finite numbers.
+        """
         return np.clip(self.as_coordinates(z), self.low_, self.high_)
 
     def decode_values(
         self, z: ArrayLike, offset: Float32 | None = None, cells: ArrayLike | None = None
     ) -> Float32:
-        """f_r (n, 3) in 1/sr at cells of the grid, float32: positive and with albedo <= 1.
+        """Decode f_r at cells of the grid: positive, and with albedo <= 1.
 
-        `z` is clipped to the gamut box; where the directional albedo of any colour at any of the
-        16 check angles exceeds 1, all colours are divided by it.
+        `z` is clipped to the gamut box; where the directional albedo of any colour at any of the 16
+        check angles exceeds 1, all colours are divided by it.
 
         Parameters
         ----------
         z : (k,) array_like
         offset : (cells, 3) float32, optional
-            Added to log(f + FLOOR): what a given table has beyond the manifold. Always for the
-            whole grid.
+            Added to log(f + FLOOR): what a given table has beyond the space. Always for the whole
+            grid.
         cells : (n,) integers, optional
-            Flat indices of the cells to decode, in any order; all of them if left out. The
-            energy check reads the cells that it needs (three quarters of the grid) in either
-            case, so values are those of the whole table, to float32 rounding.
+            Flat indices of the cells to decode, in any order; all of them if left out. The energy
+            check reads the cells that it needs (three quarters of the grid) in either case, so
+            values are those of the whole table, to float32 rounding.
+
+        Returns
+        -------
+        (n, 3) float32, in 1/sr
 
         Raises
         ------
@@ -544,36 +561,48 @@ class BRDFEmbedding:
         return shown
 
     def energy_scale(self, z: ArrayLike, offset: Float32 | None = None) -> float:
-        """The factor in (0, 1] by which `decode_values` lowers f to keep the albedo within 1.
+        """Return the factor in (0, 1] by which `decode_values` lowers f to conserve energy.
 
-        1 where nothing is lowered. Below that the shown material is darker than its coordinates
-        say, and its traits are less pronounced than their scores.
+        Below 1 the shown material is darker than its coordinates say, and its traits are less
+        pronounced than their scores.
+
+        Parameters
+        ----------
+        z, offset
+            As for `decode_values`.
         """
         return min(1.0, 1.0 / max(self._decode(z, offset)[1], 1e-30))
 
     def jacobian(
         self, z: ArrayLike, offset: Float32 | None = None, cells: ArrayLike | None = None
     ) -> Float32:
-        """d f / d z (n, 3, k) in 1/sr, float32, of what `decode_values` returns at `cells`.
+        """Differentiate `decode_values` by the coordinates, in closed form.
 
-        In closed form, with the slope of the energy scaling where that is active.
+        The slope of the energy scaling is included where that is active.
 
         Parameters
         ----------
         z, offset, cells
             As for `decode_values`.
 
+        Returns
+        -------
+        (n, 3, k) float32, in 1/sr
+
         Notes
         -----
         `decode_values` has kinks; there the slope is that of one side or of the mean:
 
-        - A coordinate outside the gamut box moves nothing (`z` is clipped): its column is 0. On
-          the face of the box the column is the slope towards the inside.
-        - Where f before the energy scaling is held at 0, or at the cap of 1e13, that has slope
-          0; exactly on these kinks, the slope of the side on which it moves.
-        - The energy scaling follows the greatest albedo. Where several are greatest to 1e-6
-          (the three colours of a grey material) it is the mean of their slopes, so that no
-          colour is favoured. Where the greatest is exactly 1, f counts as not scaled.
+        - A coordinate outside the gamut box changes nothing (`z` is clipped): its column is 0. On
+        the face
+          of the box the column is the slope towards the inside.
+        - Where f before the energy scaling is held at 0, or at the upper bound of 1e13, that has
+        slope 0;
+          exactly on these kinks, the slope of the side on which it moves.
+        - The energy scaling follows the greatest albedo. Where several are greatest to 1e-6 (the
+        three
+          colours of a grey material) it is the mean of their slopes, so that no colour is favoured.
+          Where the greatest is exactly 1, f counts as not scaled.
 
         Raises
         ------
@@ -583,7 +612,7 @@ class BRDFEmbedding:
         point = self.as_coordinates(z)
         clipped = self.clip(point)
         self._check_offset(offset)
-        logs, source, share, first = self._profiles.sources(self._logs(clipped))
+        logs, source, share, first = self.profiles_.sources(self._logs(clipped))
         if offset is not None:
             logs += offset.T
         index = slice(None) if cells is None else self._cell_indices(cells)
@@ -612,12 +641,14 @@ class BRDFEmbedding:
         return result
 
     def _log_slopes(self, colour: int, source: Int64, share: Float32, first: Int64) -> Float32:
-        """d log(f + FLOOR) / d z (n, k) of one colour, at cells of which `Profiles.sources` says
-        where they come from."""
+        """Return d log(f + FLOOR) / d z (n, k) of one colour.
+
+        The cells are those from which `Profiles.sources` says values come.
+        """
         rows = self.components_.take(source, axis=0)
         some = np.flatnonzero(share)
         if len(some):
-            last = self._profiles.last
+            last = self.profiles_.last
             own = source[some] % len(last)
             trend = self.components_[last[own] * len(last) + own] - self.components_[first[own]]
             rows[some] += share[some, None] * trend
@@ -630,23 +661,23 @@ class BRDFEmbedding:
         offset: Float32 | torch.Tensor | None = None,
         cells: ArrayLike | None = None,
     ) -> torch.Tensor:
-        """`decode_values` in torch, on the device and in the precision of `z`; differentiable.
+        """Decode as `decode_values` does, in torch, on the device and in the precision of `z`.
 
-        Its gradient by `z` is `jacobian`, with the same choices at the kinks, and it passes to
-        an `offset` that requires one.
+        The result is differentiable. Its gradient by `z` is `jacobian`, with the same choices at
+        the kinks; an `offset` that requires a gradient gets one.
 
         Parameters
         ----------
         z : (k,) tensor, float32 or float64
-            Not checked for coordinates that are not finite (a device would have to be waited
-            for): they give NaN.
+            Not checked for coordinates that are not finite, since that would wait for the device:
+            they give NaN.
         offset : (cells, 3) array or tensor, optional
         cells : (n,) integers, optional
-            As for `decode_values`; on the host.
+            As for `decode_values`; in host memory.
 
         Returns
         -------
-        (n, 3) tensor
+        (n, 3) tensor, in 1/sr
 
         Raises
         ------
@@ -667,7 +698,7 @@ class BRDFEmbedding:
             offset = whole.to(z)
         on = self._on(z.device, z.dtype)
         span = on.mixing @ torch.clamp(z, on.low, on.high) @ on.basis + on.mean
-        logs = self._profiles.keep(span)
+        logs = self.profiles_.keep(span)
         if offset is not None:
             logs = logs + offset.T
         f = reflectance(torch, logs)
@@ -680,7 +711,7 @@ class BRDFEmbedding:
         return scaled
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> _Tensors:
-        """The fitted state as tensors, kept: 2 MB in float32 for the default embedding."""
+        """Return the fitted state as tensors, and keep them (2 MB for the default embedding)."""
         import torch
 
         key = (device, dtype)
@@ -721,37 +752,51 @@ class BRDFEmbedding:
             raise ValueError(f"offset: expected shape {expected}, got {tuple(offset.shape)}")
 
     def _logs(self, z: ArrayLike) -> Float32:
-        """log(f + FLOOR) (3, cells) of the linear span, before its profiles are made decent."""
+        """Return log(f + FLOOR) (3, cells) of the linear space, before profiles are corrected."""
         scores = (self._mixing @ self.clip(z)).astype(np.float32)
         logs: Float32 = product(scores, self._basis)
         logs += self.mean_
         return logs
 
     def _decode(self, z: ArrayLike, offset: Float32 | None) -> tuple[Float32, float]:
-        """f (3, cells) before its energy is checked, and its greatest directional albedo."""
+        """Return f (3, cells) before its energy check, and its greatest directional albedo."""
         span = self._logs(z)
         self._check_offset(offset)
-        logs: Float32 = self._profiles.keep(span)
+        logs: Float32 = self.profiles_.keep(span)
         if offset is not None:
             logs += offset.T
         values: Float32 = reflectance(np, logs, out=logs)
         return values, float(product(values, self._check).max())
 
     def residual(self, brdf: TabulatedBRDF, z: ArrayLike | None = None) -> Float32:
-        """(cells, 3) difference of log(f + FLOOR) between a table and its encoding, or point `z`.
+        """Return the difference of log(f + FLOOR) between a table and its encoding.
 
         ``decode_values(encode(brdf), residual(brdf))`` is the table itself.
+
+        Parameters
+        ----------
+        brdf : TabulatedBRDF
+        z : (k,) array_like, optional
+            A point that takes the place of the table's encoding.
+
+        Returns
+        -------
+        (cells, 3) float32
         """
         self._fitted()
         table = brdf.regrid(self.grid_)
-        decoded = self._profiles.keep(self._logs(self.encode(table) if z is None else z)).T
+        decoded = self.profiles_.keep(self._logs(self.encode(table) if z is None else z)).T
         return np.asarray(log_map(table.values).reshape(-1, 3) - decoded, np.float32)
 
     def body_rows(self) -> Float64:
-        """(3, k) rows that give, to a constant, the mean log f of the body on the colour axes.
+        """Return rows that give the mean log f of the body on the colour axes, up to a constant.
 
-        The body is what is seen between 35 and 50 degrees from the mirror direction's half
-        vector, far from grazing; log f is linear in the coordinates, so this is exact.
+        The body is what is seen between 35 and 50 degrees from the mirror direction's half vector,
+        far from grazing; log f is linear in the coordinates, so this is exact.
+
+        Returns
+        -------
+        (3, k) float64
         """
         self._fitted()
         th, td, _ = self.grid_.node_angles()
@@ -761,28 +806,66 @@ class BRDFEmbedding:
         return np.asarray(OPPONENT @ (row @ self._mixing), np.float64)
 
     def log_rows(self, cells: ArrayLike) -> tuple[Float64, Float64]:
-        """(3, n, k) rows and (n,) constants: log(f + FLOOR) at cells of `grid_`, before `profiles`
-        and the energy check, is ``rows @ z + constants``."""
+        """Return log(f + FLOOR) at cells as a linear function of the coordinates.
+
+        It is ``rows @ z + constants``, before profiles are corrected and energy is checked.
+
+        Parameters
+        ----------
+        cells : (n,) integers
+            Flat indices of cells of `grid_`.
+
+        Returns
+        -------
+        rows : (3, n, k) float64
+        constants : (n,) float64
+
+        Raises
+        ------
+        ValueError
+            On an index outside the grid.
+        """
         at = self._cell_indices(cells)
         rows = np.einsum("nm,cmk->cnk", self.components_[at].astype(np.float64), self._mixing)
         return rows, self.mean_[at].astype(np.float64)
 
     def decode(self, z: ArrayLike, grid: HalfDiffGrid | None = None) -> TabulatedBRDF:
-        """The table at coordinates `z` (k,), on the embedding's grid or any other."""
+        """Decode a table.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+        grid : HalfDiffGrid, optional
+            The table's grid; the embedding's own if left out.
+
+        Raises
+        ------
+        ValueError
+            If `z` is not k finite numbers.
+        """
         values = self.decode_values(z).reshape(*self.grid_.shape, 3)
         table = TabulatedBRDF(self.grid_, values)
         return table if grid is None else table.regrid(grid)
 
+    def fingerprint(self) -> str:
+        """Return a name of the state: coordinates of another embedding mean other materials."""
+        state = sorted(self.arrays().items())
+        whole = b"".join(n.encode() + np.ascontiguousarray(v).tobytes() for n, v in state)
+        return hashlib.sha256(whole).hexdigest()[:16]
+
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The fitted state as plain arrays, components in float16 (their error is 1e-3 of f)."""
+        """Return the fitted state as plain arrays.
+
+        Components are rounded to float16 (an error of 1e-3 of f).
+        """
         self._fitted()
         return {
             "grid": np.array(self.grid_.shape),
             "n_components": np.array(self.n_components),
             "mean": self.mean_,
             "components": self.components_.astype(np.float16),
-            "share": self._profiles.share.astype(np.float16),
-            "grazing": self._profiles.grazing.astype(np.float16),
+            "share": self.profiles_.share.astype(np.float16),
+            "grazing": self.profiles_.grazing.astype(np.float16),
             "low": self.low_,
             "high": self.high_,
             "explained_variance_ratio": self.explained_variance_ratio_,
@@ -790,7 +873,12 @@ class BRDFEmbedding:
 
     @classmethod
     def from_arrays(cls, state: dict[str, NDArray[Any]]) -> BRDFEmbedding:
-        """The inverse of `arrays`."""
+        """Make an embedding from its arrays, the inverse of `arrays`.
+
+        Parameters
+        ----------
+        state : dict of arrays
+        """
         components = state["components"].astype(np.float32)
         achromatic, chromatic = (int(n) for n in state["n_components"])
         result = cls((achromatic, chromatic))
@@ -802,50 +890,10 @@ class BRDFEmbedding:
         result.low_ = state["low"].astype(np.float64)
         result.high_ = state["high"].astype(np.float64)
         result.explained_variance_ratio_ = state["explained_variance_ratio"].astype(np.float64)
-        result._profiles = replace(
+        result.profiles_ = replace(
             Profiles.none(result.grid_),
             share=state["share"].astype(np.float32),
             grazing=state["grazing"].astype(np.float32),
         )
         result._prepare()
         return result
-
-
-def _mixing(n_components: tuple[int, int]) -> Float64:
-    """(3, m, k): what a coordinate gives to each channel's scores on the m components."""
-    achromatic, chromatic = n_components
-    result = np.zeros((3, achromatic + chromatic, achromatic + 2 * chromatic))
-    grey, red_blue, green = OPPONENT
-    result[:, :achromatic, :achromatic] = grey[:, None, None] * np.eye(achromatic)
-    middle = achromatic + chromatic
-    result[:, achromatic:, achromatic:middle] = red_blue[:, None, None] * np.eye(chromatic)
-    result[:, achromatic:, middle:] = green[:, None, None] * np.eye(chromatic)
-    return result
-
-
-def _checked_grid(tables: Iterable[TabulatedBRDF]) -> tuple[HalfDiffGrid, int]:
-    """The grid of tables that can be fitted to, and their number."""
-    grid, count = None, 0
-    for table in tables:
-        if grid is None:
-            grid = table.grid
-        elif table.grid != grid:
-            raise ValueError("tables: expected all on one grid, got several")
-        count += 1
-    if grid is None or count < 2:
-        raise ValueError(f"tables: expected at least two, got {count}")
-    if grid.layout != "folded":
-        raise ValueError(f"tables: expected the 'folded' layout, got {grid.layout!r}")
-    return grid, count
-
-
-def _batches(tables: Iterable[TabulatedBRDF]) -> Iterator[Float32]:
-    """log(f + FLOOR) (n, 3, cells) of some tables at a time."""
-    waiting: list[Float32] = []
-    for table in tables:
-        waiting.append(channel_logs(table))
-        if len(waiting) == _BATCH:
-            yield np.stack(waiting)
-            waiting.clear()
-    if waiting:
-        yield np.stack(waiting)

@@ -1,21 +1,21 @@
-"""What a BRDF may do along theta_h: no holes in highlights, no spikes that no material has.
+"""Constraints on log f along theta_h: no holes in highlights, no spikes that no material has.
 
 A linear space of log f holds lobes with holes in them (Matusik et al. 2003 met them) and spikes
-towards grazing. A profile is log f along theta_h at fixed theta_d and phi_d; every profile that
-is decoded is made to keep to what those of the library do, by little, in an order:
+towards grazing. A profile is log f along theta_h at fixed theta_d and phi_d. Every decoded profile
+is corrected, by as little as possible, to what profiles of the library do. In this order:
 
-1. The trend is what a profile rises from its first 10 degrees, at their brightest, to the last
-   node that both directions reach (50 degrees at most), if it does: velvets do, highlights do not,
-   with a hole or without. A share of it is allowed at every node, as early as the earliest of the
-   library.
-2. Up to `HIGHLIGHT` a profile does not rise beyond that: what lies lower than what follows is
-   filled.
-3. Nowhere does it rise above its least so far by more than any member of the library: what stands
-   out is cut.
+1. The trend of a profile is its rise from its maximum in the first 10 degrees to the last node that
+   both directions reach (50 degrees at most), or 0 if it falls. Velvets rise; highlights do not,
+   with a hole or without. At each node a share of the trend is allowed, the greatest share that a
+   member of the library has there.
+2. Up to `HIGHLIGHT` a profile does not rise by more than that: a value lower than a later one is
+   raised to it.
+3. Nowhere does a profile rise above its running minimum by more than any member of the library
+   does: the excess is cut.
 4. Up to `HIGHLIGHT` there is no valley: it is filled to its lower rim.
 
-What keeps to this already stays as it is. Beyond theta_d = 80 degrees, next to the horizon, only
-the third holds.
+A profile that meets these conditions does not change. Beyond theta_d = 80 degrees, next to the
+horizon, only the third applies.
 """
 
 from __future__ import annotations
@@ -35,30 +35,36 @@ Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 
 HIGHLIGHT = math.radians(30.0)
-"""theta_h up to which a profile has no valley."""
+"""theta_h in radians up to which a profile has no valley."""
 
 _TALL = math.radians(80.0)
 _TREND = math.radians(50.0)
 _CORE = math.radians(10.0)
 _RISES = 0.1
-"""Trends below this (in log f) do not say what shares of a trend the library has."""
+"""Trends below this (in log f) do not count when the library's shares are measured."""
 
 _EARLY = 0.7
-"""The most of its trend that a profile may rise in its first 10 degrees: models of sheen have a
-dark point in the middle that no cloth has."""
+"""Upper bound of the share of its trend by which a profile may rise in its first 10 degrees: models
+of sheen have a dark point in the middle that no cloth has.
+"""
 
 
 @dataclass(frozen=True)
 class Profiles:
-    """What is allowed, for n = n_theta_d * n_phi_d profiles of n_theta_h nodes.
+    """What is allowed of n = n_theta_d * n_phi_d profiles with n_theta_h nodes each.
 
     Parameters
     ----------
-    share : (n_theta_h, n) float32 in [0, 1.7], the share of its trend that a profile may have risen
-    grazing : (n_theta_h, n) float32, the rise in log f that is allowed beyond that
-    inner : (n,) int32, how many of the first nodes belong to the highlight
-    last : (n,) int32, the node at which the trend is read
-    core : how many of the first nodes it is counted from
+    share : (n_theta_h, n) float32 in [0, 1.7]
+        The share of its trend by which a profile may have risen at a node.
+    grazing : (n_theta_h, n) float32
+        The rise in log f that is allowed beyond that.
+    inner : (n,) int32
+        How many of the first nodes belong to the highlight.
+    last : (n,) int32
+        The node at which the trend is read.
+    core : int
+        How many of the first nodes the trend may start from.
     """
 
     share: Float32
@@ -69,7 +75,12 @@ class Profiles:
 
     @classmethod
     def none(cls, grid: HalfDiffGrid) -> Profiles:
-        """Before a library says more: no rise but the trend's, and that late."""
+        """Return the profiles to start from: no rise is allowed but the trend's, at its last node.
+
+        Parameters
+        ----------
+        grid : HalfDiffGrid
+        """
         lower = grid.lower_cosine.reshape(grid.n_theta_h, -1)
         nodes = np.arange(grid.n_theta_h)[:, None]
         wide, narrow = (np.maximum((lower > c).sum(axis=0) - 1, 0) for c in (0.1, 0.2))
@@ -88,9 +99,16 @@ class Profiles:
 
     @classmethod
     def of(cls, logs: Callable[[], Iterator[Float32]], grid: HalfDiffGrid) -> Profiles:
-        """Those of a library, gone through twice in batches of log f (n, 3, cells).
+        """Measure what a library's members do.
 
-        No member is changed but for valleys in its highlight, and dark points in its middle.
+        Later corrections change no member, except for valleys in its highlight and a dark point in
+        its middle.
+
+        Parameters
+        ----------
+        logs : callable
+            Returns an iterator of batches (n, 3, cells) of log(f + FLOOR); it is called twice.
+        grid : HalfDiffGrid
         """
         free = cls.none(grid)
         share, grazing = free.share.copy(), free.grazing.copy()
@@ -111,17 +129,27 @@ class Profiles:
         return replace(free, share=share, grazing=np.maximum.accumulate(grazing, axis=0))
 
     def _trend(self, x: Float32) -> Float32:
-        """(..., 1, n) of profiles (..., n_theta_h, n)."""
+        """Return the trend (..., 1, n) of profiles (..., n_theta_h, n)."""
         first = x[..., : self.core, :].max(axis=-2)
         rise = x[..., self.last, np.arange(len(self.last))] - first
         trend: Float32 = np.maximum(rise, 0.0)[..., None, :]
         return trend
 
     def keep(self, logs: Any) -> Any:
-        """log f (3, cells) that keeps to it: a tensor of a tensor (differentiable), else arrays."""
+        """Correct profiles.
+
+        Parameters
+        ----------
+        logs : (3, cells) array or tensor
+            log(f + FLOOR).
+
+        Returns
+        -------
+        (3, cells) array or tensor, as given; a tensor is differentiable
+        """
         if isinstance(logs, np.ndarray):
             return self.sources(logs)[0]
-        import torch  # it takes a second, which arrays need not wait for
+        import torch  # importing it takes a second, which arrays need not wait for
 
         found = self.sources(logs.detach().cpu().numpy())
         kept, cells, extra, first = (torch.from_numpy(v).to(logs.device) for v in found)
@@ -129,24 +157,30 @@ class Profiles:
         profile = torch.arange(logs.shape[1], device=logs.device) % len(last)
         trend = logs[:, last[profile] + profile] - logs.gather(1, first[:, profile])
         moved = logs.gather(1, cells) + extra.to(logs.dtype) * trend
-        # its slopes, and the very values
+        # slopes of the one, and exactly the values of the other
         kept_here: torch.Tensor = moved + (kept - moved).detach()
         return kept_here
 
     def sources(
         self, logs: NDArray[Any]
     ) -> tuple[NDArray[Any], NDArray[np.int64], Float32, NDArray[np.int64]]:
-        """log f (3, cells) that keeps to it, and where it comes from.
+        """Correct profiles, and tell which values the result is made of.
+
+        Parameters
+        ----------
+        logs : (3, cells) array
+            log(f + FLOOR).
 
         Returns
         -------
         kept : (3, cells)
+            The corrected log(f + FLOOR).
         cells : (3, cells) int64
             The cell of the same profile and colour whose value is taken.
         extra : (3, cells) float32
-            How much of the profile's trend comes on top, where it has one; 0 elsewhere.
+            The share of the profile's trend that is added to it; 0 where there is no trend.
         first : (3, n) int64
-            The cell that each profile's trend is counted from.
+            The cell that each profile's trend starts from.
         """
         x = np.ascontiguousarray(logs).reshape(3, *self.share.shape)
         allowed = self.share, self.grazing, self.inner, self.last, self.core
@@ -158,9 +192,10 @@ class Profiles:
 
 @numba.njit(cache=True, nogil=True)
 def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any, core: Any) -> Any:
-    """Values, source nodes, extra shares of the trend, its first nodes; x (3, nodes, profiles).
+    """Correct profiles x (3, nodes, profiles).
 
-    Rows are gone through whole, so that the profiles of a row are done at once.
+    Returns the values, their source nodes, the shares of the trend added to them, and the nodes
+    that trends start from. Rows are processed whole, so that all profiles of a row vectorise.
     """
     colours, nodes, profiles = x.shape
     y, source = np.empty_like(x), np.empty(x.shape, np.int32)
@@ -197,7 +232,7 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any, core: Any) ->
                 less = v < best[j]
                 best[j] = v if less else best[j]
                 at[j] = own if less else at[j]
-                # what stands where it stood keeps its very bits
+                # an unchanged value keeps its exact bits
                 y[c, i, j] = x[c, i, j] if source[c, i, j] == i else moved
         for j in range(profiles):
             best[j], at[j] = -np.inf, 0
@@ -217,7 +252,7 @@ def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any, core: Any) ->
                 lower = best[j] < rim[i, j]
                 rim[i, j] = best[j] if lower else rim[i, j]
                 place[i, j] = at[j] if lower else place[i, j]
-        # from the middle outwards, nothing is read that was written: rims are maxima of others
+        # safe in place: `rim` is a copy, so no value that was written is read again
         for i in range(most):
             for j in range(profiles):
                 if i < inner[j] and place[i, j] != i:

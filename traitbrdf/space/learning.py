@@ -13,18 +13,23 @@ from traitbrdf.space.library import Library, default_library
 
 if TYPE_CHECKING:
     from traitbrdf.reflectance.brdf import TabulatedBRDF
-from traitbrdf.space.traits import Definition, TraitSpace, as_labels, default_traits
+from traitbrdf.space.definitions import Definition, as_labels
+from traitbrdf.space.traits import TraitSpace, default_traits
 
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Trait(Definition):
-    """A trait of one's own: what labels or ratings of some materials say.
+    """A trait of one's own, learnt from labels or ratings of some materials.
 
-    Learnt are weights of the graded descriptors of the space, which say more than coordinates
-    where there are few labels: "like these, not like those" is said of what is seen. The straight
-    part is zeros.
+    Bayesian linear regression finds weights of the space's graded descriptors. With few labels
+    these say more than coordinates, since people label what they see. The straight part is zero.
+
+    Attributes
+    ----------
+    name, weights, normal, typical, meaning, synonyms
+        As for `traitbrdf.space.definitions.Definition`.
     """
 
     @classmethod
@@ -37,20 +42,27 @@ class Trait(Definition):
         library: Library | None = None,
         meaning: str = "",
     ) -> Trait:
-        """A trait from a handful of labels.
+        """Learn a trait from a handful of labels.
 
         Parameters
         ----------
         name : str
-        materials : (n, k) coordinates, or n library names, tables, or (k,) coordinates
-        labels : (n,) 1 has it, -1 has it not, 0 unclear
-        space, library : None are the shipped ones
+        materials : n materials
+            (n, k) coordinates, or a sequence of library names, tables and (k,) coordinates.
+        labels : (n,) array_like
+            1 has the trait, -1 does not have it, 0 is unclear.
+        space : TraitSpace, optional
+            Where descriptors are graded; the shipped one if left out.
+        library : Library, optional
+            Whose members say how descriptors vary; the shipped one if left out.
+        meaning : str
+            One line that explains the trait.
 
         Raises
         ------
         ValueError
-            If there is no material with the trait, or none without it; on other values than -1, 0
-            and 1, shapes that do not match, or materials labelled both ways.
+            If no material has the trait, or none lacks it; on values other than -1, 0 and 1, shapes
+            that do not match, or a material labelled both ways.
         """
         z = _as_points(materials, library)
         given = as_labels(labels, len(z), name)
@@ -73,9 +85,13 @@ class Trait(Definition):
         library: Library | None = None,
         meaning: str = "",
     ) -> Trait:
-        """A trait from ratings (n,), any finite numbers of which more is more of it.
+        """Learn a trait from ratings.
 
-        Other parameters as for `from_labels`.
+        Parameters
+        ----------
+        ratings : (n,) array_like
+            Any finite numbers; a higher one means more of the trait.
+        Other parameters as for `from_labels`
 
         Raises
         ------
@@ -102,6 +118,7 @@ class Trait(Definition):
         library: Library | None,
         meaning: str,
     ) -> Trait:
+        """Learn weights of graded descriptors from targets (n,) at points (n, k)."""
         space = default_traits() if space is None else space
         library = default_library() if library is None else library
         grades = space.grades(z)
@@ -126,18 +143,28 @@ def suggest(
     space: TraitSpace | None = None,
     library: Library | None = None,
 ) -> int:
-    """Which of the candidates says most of a trait, if it is labelled next.
+    """Choose the candidate whose label would say most about a trait.
 
-    The one of whose score a linear model knows least, given what is labelled already (the variance
-    of Bayesian linear regression; labels themselves do not matter).
+    This is the one where the prediction of the trait is least certain.
 
     Parameters
     ----------
-    labelled, candidates : as for `Trait.from_labels`; `labelled` may be empty
+    labelled : materials that are labelled already, as for `Trait.from_labels`; may be empty
+    candidates : materials to choose from, at least one
+    space : TraitSpace, optional
+        The shipped one if left out.
+    library : Library, optional
+        The shipped one if left out.
 
     Returns
     -------
-    int, the index among the candidates
+    int
+        Index among the candidates.
+
+    Raises
+    ------
+    ValueError
+        If there is no candidate, or a name is unknown.
     """
     space = default_traits() if space is None else space
     known = space.grades((default_library() if library is None else library).coordinates)
@@ -149,22 +176,36 @@ def suggest(
     return int(np.argmax(np.einsum("nd,nd->n", rows, np.linalg.solve(precision, rows.T).T)))
 
 
-_NOISE = 2.0  # variance of a label, twice that of the trait: people disagree
+_NOISE = 2.0  # variance of a label where the trait has variance 1: people disagree
 
 
 def _posterior(grades: Float64, known: Float64) -> tuple[Float64, Float64]:
-    """Precision (d, d) of a trait's weights given materials (n, d), and what turns targets into
-    its pull (d, n). A trait is as likely to follow what members differ in as they differ in it."""
+    """Return the posterior of a trait's weights, given graded descriptors of materials.
+
+    The prior follows the library: a trait is the likelier to depend on a combination of
+    descriptors, the more members differ in it.
+
+    Parameters
+    ----------
+    grades : (n, d) graded descriptors of the materials
+    known : (m, d) graded descriptors of the library
+
+    Returns
+    -------
+    precision : (d, d)
+    pull : (d, n)
+        Turns targets into the right-hand side of the normal equations.
+    """
     cov = np.cov(known.T)
     scale, axes = np.linalg.eigh(cov)
-    # prior covariance of weights, so that scores vary by one and mostly along the widest axes
+    # prior covariance of the weights: scores have unit variance, mostly along the widest axes
     prior = axes * np.maximum(scale, 1e-6) @ axes.T / np.sum(scale**2)
     centred = grades - known.mean(axis=0)
     return np.linalg.inv(prior) + centred.T @ centred / _NOISE, centred.T / _NOISE
 
 
 def _as_points(materials: Materials, library: Library | None) -> Float64:
-    """(n, k) coordinates of materials by name, table or coordinates."""
+    """Return coordinates (n, k) of materials given by name, table or coordinates."""
     library = default_library() if library is None else library
     found = []
     for material in materials:  # type: ignore[union-attr]

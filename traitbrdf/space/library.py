@@ -5,34 +5,45 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from traitbrdf.formats.files import artifact, unknown_name
-from traitbrdf.reflectance.brdf import (
-    TabulatedBRDF,
-)
-
-if TYPE_CHECKING:  # where it is needed it is imported: it takes a second
-    pass
+from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.space.embedding import BRDFEmbedding
 
 
 class Library:
     """Named materials as points of an embedding.
 
+    Parameters
+    ----------
+    embedding : BRDFEmbedding
+    names : n str
+    coordinates : (n, k) array_like
+    families : n str
+        The kind of material that each member is.
+    parameters : n mappings, optional
+        What the recipe of a member's family was given, by name: numbers, and colours as lists of
+        three; empty where unknown. Together with the recipe's seed they make the member again.
+    descriptors : mapping of (n,) array_like, optional
+        Physical descriptors of each member's own table, by name
+        (`traitbrdf.reflectance.descriptors`).
+
     Attributes
     ----------
+    embedding : BRDFEmbedding
     names, families : tuples of str
     coordinates : (n, k) float64
     parameters : tuple of mappings
-        What the recipe of a member's family was given, by name: numbers, and colours as lists of
-        three; empty where unknown. With the recipe's seed they are what `data_gen` draws.
     descriptors : dict of (n,) float64
-        Physical descriptors of each member's own table, by name
-        (`traitbrdf.reflectance.descriptors`).
+
+    Raises
+    ------
+    ValueError
+        If the numbers of names, coordinates, parameters and descriptors differ.
     """
 
     def __init__(
@@ -80,13 +91,17 @@ class Library:
         return f"Library({len(self)} materials of {len(set(self.families))} families)"
 
     def __getitem__(self, name: str) -> TabulatedBRDF:
-        """The decoded table of a material."""
+        """Decode the table of a material."""
         table = self.embedding.decode(self.coordinates[self.index(name)])
         table.name = name
         return table
 
     def index(self, name: str) -> int:
-        """Where `name` stands in `names`.
+        """Return where a material stands in `names`.
+
+        Parameters
+        ----------
+        name : str
 
         Raises
         ------
@@ -100,13 +115,16 @@ class Library:
 
 @functools.lru_cache(maxsize=1)
 def default_embedding() -> BRDFEmbedding:
-    """The embedding that the package ships."""
+    """Load the embedding that the package ships, once."""
     return BRDFEmbedding.from_arrays(artifact())
 
 
 @functools.lru_cache(maxsize=1)
 def default_library() -> Library:
-    """The named materials that the package ships, as points of `default_embedding`."""
+    """Load the named materials that the package ships, once.
+
+    Their coordinates are points of `default_embedding`.
+    """
     state = artifact()
     return Library(
         default_embedding(),

@@ -1,4 +1,4 @@
-"""A material of a part: coordinates, and what they leave out."""
+"""The material of one part: its coordinates, and what these leave out."""
 
 from __future__ import annotations
 
@@ -19,15 +19,20 @@ Int64 = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What one part is made of; equal if it is the same reflectance, of the same name.
+    """The material of one part; two are equal if reflectance and name are the same.
 
     Attributes
     ----------
-    z : (k,) coordinates
-    mirror : (3,) weight of a perfect mirror beside the table
-    offset : (cells, 3) or None, what an assigned table has in log f beyond the manifold
-    table : (cells, 3) or None, an assigned table as it came, until it is edited
-    name : what it was assigned from
+    z : (k,) float64
+        Coordinates in the embedding.
+    mirror : (3,) float64
+        Weight of a perfect mirror that is added to the table, for each channel.
+    offset : (cells, 3) float32 or None
+        What an assigned table has in log(f + FLOOR) beyond the table decoded at `z`.
+    table : (cells, 3) float32 or None
+        f in 1/sr of an assigned table, unchanged; None once the material has been edited.
+    name : str
+        The library member, file or model that it was assigned from.
     """
 
     z: Float64
@@ -38,13 +43,37 @@ class Material:
 
     @classmethod
     def of_library(cls, name: str, library: Library) -> Material:
-        """A member of a library by its name; ValueError on an unknown one."""
+        """Make the material of a library member.
+
+        Parameters
+        ----------
+        name : str
+        library : Library
+
+        Raises
+        ------
+        ValueError
+            On an unknown name.
+        """
         z = library.coordinates[library.index(name)]
         return cls(library.embedding.clip(z), np.zeros(3), name=name)
 
     @classmethod
     def of_reflectance(cls, brdf: Reflectance, embedding: BRDFEmbedding) -> Material:
-        """A table, a model or a measurement, as it comes and as the nearest coordinates."""
+        """Make a material of a table, a model or a measurement.
+
+        It is shown unchanged until it is edited; edits start at its nearest coordinates.
+
+        Parameters
+        ----------
+        brdf : Reflectance
+        embedding : BRDFEmbedding
+
+        Raises
+        ------
+        TypeError
+            On something that has no ``eval``.
+        """
         grid = embedding.grid_
         name = str(getattr(brdf, "name", "")) or type(brdf).__name__
         table = (
@@ -58,7 +87,7 @@ class Material:
 
     @functools.cached_property
     def _key(self) -> tuple[object, ...]:
-        # tables are large: one that was assigned anew is another
+        # tables are large, so they are compared by identity
         return self.name, id(self.table), id(self.offset), self.z.tobytes(), self.mirror.tobytes()
 
     def __eq__(self, other: object) -> bool:
@@ -68,17 +97,33 @@ class Material:
         return hash(self._key)
 
     def energy_scale(self, embedding: BRDFEmbedding) -> float:
-        """The factor by which it is lowered to reflect no more than all light."""
-        if self.table is not None:  # shown as it came
+        """Return the factor in (0, 1] by which the shown material is darkened to conserve energy.
+
+        Parameters
+        ----------
+        embedding : BRDFEmbedding
+        """
+        if self.table is not None:  # shown unchanged
             return 1.0
         return embedding.energy_scale(self.z, self.offset)
 
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
-        """f_r (n, 3) at `cells` (n,) of the embedding's grid; at all of them if left out."""
+        """Return f_r in 1/sr at cells of the embedding's grid.
+
+        Parameters
+        ----------
+        embedding : BRDFEmbedding
+        cells : (n,) int64, optional
+            Flat indices of cells; all of them if left out.
+
+        Returns
+        -------
+        (n, 3) float32
+        """
         if self.table is not None:
             whole = self.table
         elif cells is None or 2 * len(cells) > embedding.grid_.size:
-            # the energy check reads most of the grid: of many cells, all come as fast
+            # the energy check reads most of the grid, so decoding all of it takes no longer
             whole = embedding.decode_values(self.z, self.offset)
         else:
             return embedding.decode_values(self.z, self.offset, cells)

@@ -1,13 +1,14 @@
 """Where moves of traits lead: a flow through the embedding.
 
-A move is the solution of dz/dt = v(z). The velocity v is the one that costs least: it is as short
-as can be in a covariance of the library, changes moved scores as fast as asked for, held ones not
-at all, and what had better stay, unrelated scores and the colours that a person sees, as little as
-can be. That is a quadratic programme in the box (Nocedal & Wright 2006, chapter 16), solved at each
-point alike: so a way is continuous, has no memory, and can be gone back.
+A move is the solution of dz/dt = v(z), where t counts the change of the scores. The velocity v
+minimises a quadratic cost: its length in the library's Mahalanobis distance, the failure of moved
+scores to change as fast as asked, any change of held scores, and, with smaller weights, changes of
+unrelated scores and of the colours that a person sees. With the gamut box and the other limits this
+is a quadratic programme (Nocedal & Wright 2006, chapter 16). It is solved anew at each point from
+that point alone, so the curve is continuous, does not depend on earlier moves, and can be followed
+back.
 
-`Density`, `Grades` and `Readings` say where the library is and what scores are read off; `Ground`
-is all of it, as arrays, and `Task` one move.
+`Ground` computes scores and limits at a point, and `Task` describes one move.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.space.holding import HeldCosts
 from traitbrdf.space.scores import (
     BESIDE,
     BODY_OF,
@@ -36,87 +38,107 @@ from traitbrdf.space.scores import (
 )
 
 Float64 = NDArray[np.float64]
-STEP = 0.05  # in scores: how far a move goes before it looks again
-_APART = 2.0  # what a change of unrelated scores costs, beside the metric
-_BODY = 30.0  # what a change of the body costs, where it is kept
-_STEER = 0.1  # what it costs to miss a unit of a* or b* of the colour that a move leads to
-_KEEN = 4.0  # shares of what is missing that are made up for in a unit
-_TURNING = 105.0  # colour difference for a unit: no faster
-_HELD = 1e6  # what a change of a held score costs
-_WANTED = 3000.0  # what it costs that a moved score stays behind
-_FULL = 0.7  # of the way asked for: from here on all of it is made
-_WALL = 1e5  # what it costs to go through a wall
-_BACK = 0.05  # the most that a step goes back to a wall that the last one went through
-_MENDS = 4  # how often scores are put right after a step
-_EXACT = 2e-4  # how near a score is brought
-_OVER = 0.02  # log f by which a step may go through a wall
-_TRUST = 0.01  # how far a step's scores may be from what the field says
-_ASTRAY = 2e-3  # how far held scores may be from where they were
-_FALLS = 5e-4  # by which a moved score may fall in a part of a step
-_LOST = 0.02  # what is further off is no error of a step
-_LONG = 0.4  # standard deviations: no part of a step is longer
-_PARTS = 16.0  # shorter than that part of a step it is never made
-_LOOKS = 48  # at the field, in a step
-_FASTEST = 20.0  # standard deviations for a unit
-_SHOWN = 130.0  # of the CIE 1976 colour difference for a unit
-_HARDLY = 1e-9  # less than this is no way at all
-_STUCK = 0.02  # of the way asked for: what makes less has ended
-_PATIENCE = 3  # steps that come to nothing before a move ends
+
+# A move's length is measured in scores: the trait that moves most changes by 1 for each unit. A
+# velocity is in standard deviations of the coordinates for each unit. Costs are weights of squared
+# rates, beside the squared Mahalanobis length of the velocity, whose weight is 1.
+STEP = 0.05  # units between two knots of the curve
+_APART = 2.0  # cost of an unrelated score's change, for a score
+_BODY = 30.0  # cost of the body's change where it is held, for log f
+_STEER = 0.1  # cost of missing the colour that a move leads to, for a unit of L*, a* or b*
+_KEEN = 4.0  # share of the missing colour that is made up for in each unit
+_TURNING = 105.0  # CIE 1976 colour difference for each unit: colours are drawn no faster
+_HELD = 1e6  # cost of a held score's change, for a score
+_WANTED = 3000.0  # cost of missing a moved score's rate, for a score
+_FULL = 0.7  # share of the asked rate from which rates are raised until all of it is made
+_WALL = 1e5  # cost of passing a wall, for a unit of `Around.walls`
+_BACK = 0.05  # greatest return, in a step, to a wall that the last one passed (`Around.walls`)
+_MENDS = 4  # Newton steps that correct scores after a part of a step
+_EXACT = 2e-4  # error of a score at which they end
+_OVER = 0.02  # log f or log albedo by which a part of a step may pass a wall
+_TRUST = 0.01  # error of a score against the velocity's prediction that halves a part of a step
+_ASTRAY = 2e-3  # error of a held score that halves a part of a step
+_FALLS = 5e-4  # decrease of moved scores that halves a part of a step
+_LOST = 0.02  # error of a moved score above which it is accepted rather than corrected
+_LONG = 0.4  # standard deviations: greatest length of a part of a step
+_PARTS = 16.0  # parts into which a step is divided at most by halving
+_LOOKS = 48  # evaluations of the velocity in a step, at most
+_FASTEST = 20.0  # standard deviations for each unit: greatest speed
+_SHOWN = 130.0  # CIE 1976 colour difference for each unit: greatest speed of a surface's colour
+_HARDLY = 1e-9  # units: shorter distances count as zero
+_STUCK = 0.02  # share of a step: one that makes less counts as idle
+_PATIENCE = 3  # idle steps in a row at which a move ends
 
 
 class Task(NamedTuple):
-    """One move: what changes, what stays, and what had better stay.
+    """One move: what changes, what is held, and what changes as little as possible.
+
+    Costs are weights of squared rates of change in the quadratic programme.
 
     Parameters
     ----------
-    moved : (n,) scores that change
-    rates : (n,) how fast, for each unit of the way
-    held : scores that stay
-    apart : scores that had better stay
-    hue, chroma, light : (5,) each
-        What it costs that the colours of `SURFACES` change: a degree of hue, a unit of a* or b*
-        beside what lightness brings with it, a unit of L*.
-    steered : whether the move leads towards a colour, and `steer` (3,), its L*, and its a* and b*
-        for an L* + 16 of one
-    lobe : what it costs that the lobe gets a hue that all light has not, for log RGB
-    together : what it costs that L* of the body changes otherwise than that of all light
-    body : linear functions of the coordinates that say how the body looks, which stay
-    limits : (3,) the most that may be mended, and how unlikely a point may be, as
-        `Around.walls`; `inf` if it does not matter
+    moved : (n,) int64
+        Scores that change, as indices of traits.
+    rates : (n,) float64
+        Their change for each unit of the move, in [-1, 1].
+    held : int64 array
+        Scores that are held.
+    apart : int64 array
+        Unrelated scores, whose changes have a cost.
+    costs : HeldCosts
+        Costs of changes of colour and lightness, and the colour that a steered move leads to.
+    body : (rows, k) float64
+        Linear functions of the coordinates that describe the body; they are kept.
+    limits : (3,) float64
+        Upper bounds of `Around.walls`; ``inf`` for none.
     """
 
     moved: NDArray[np.int64]
     rates: Float64
     held: NDArray[np.int64]
     apart: NDArray[np.int64]
-    hue: Float64
-    chroma: Float64
-    light: Float64
-    steered: bool
-    steer: Float64
-    lobe: float
-    together: float
+    costs: HeldCosts
     body: Float64
     limits: Float64
 
     def colour_costs(self, coloured: bool) -> Float64:
-        """What changes (COLOURS,) of `_colour_rows` cost; if not `coloured`, hues may change."""
-        costs = np.zeros(COLOURS)
-        turn = costs[TURN:HUES].reshape(-1, 3)
-        turn[:, 0] = self.light
-        if self.steered:
+        """Return the cost of each colour change.
+
+        Parameters
+        ----------
+        coloured : bool
+            Whether changes of hue and chroma have a cost.
+
+        Returns
+        -------
+        (COLOURS,) float64, as `Around.colours` is ordered
+        """
+        found = np.zeros(COLOURS)
+        turn = found[TURN:HUES].reshape(-1, 3)
+        turn[:, 0] = self.costs.light
+        if self.costs.steered:
             turn[:, 1:] = _STEER
             turn[:BODY_OF, 0] += _STEER
         if coloured:
-            costs[HUES:GREYS] = self.hue
-            costs[GREYS:CHROMAS] = self.hue.repeat(2)
-            costs[CHROMAS:LOBES] = self.chroma.repeat(2)
-            costs[LOBES:BESIDE] = self.lobe
-        costs[BESIDE] = self.together
-        return costs
+            found[HUES:GREYS] = self.costs.hue
+            found[GREYS:CHROMAS] = self.costs.hue.repeat(2)
+            found[CHROMAS:LOBES] = self.costs.chroma.repeat(2)
+            found[LOBES:BESIDE] = self.costs.lobe
+        found[BESIDE] = self.costs.together
+        return found
 
     def score_costs(self, count: int) -> Float64:
-        """What it costs that scores (count,) change, or that moved ones change otherwise."""
+        """Return the cost of each score's change; for moved scores, of missing the asked rate.
+
+        Parameters
+        ----------
+        count : int
+            Number of traits t.
+
+        Returns
+        -------
+        (t,) float64
+        """
         costs = np.zeros(count)
         costs[self.apart] = _APART
         costs[self.held] = _HELD
@@ -124,10 +146,25 @@ class Task(NamedTuple):
         return costs
 
     def drawn(self, lab: Float64, turn: Float64) -> Float64:
-        """What draws (k,) colours (5, 3), of which slopes (15, k) are known, to the one that a
-        steered move leads to: by a share of what is missing, and no faster than can be followed."""
-        missing = self.steer * (lab[:, :1] + 16.0) - lab
-        missing[:, 0] = np.where(np.arange(len(lab)) < BODY_OF, self.steer[0] - lab[:, 0], 0.0)
+        """Return the linear term that draws colours towards the one that a steered move leads to.
+
+        Colours approach it by a share of the difference for each unit, at a limited speed.
+
+        Parameters
+        ----------
+        lab : (5, 3) float64
+            CIELAB of `SURFACES`.
+        turn : (15, k) float64
+            Its slopes.
+
+        Returns
+        -------
+        (k,) float64
+        """
+        missing = self.costs.steer * (lab[:, :1] + 16.0) - lab
+        missing[:, 0] = np.where(
+            np.arange(len(lab)) < BODY_OF, self.costs.steer[0] - lab[:, 0], 0.0
+        )
         far = np.sqrt(np.sum(missing * missing, axis=1, keepdims=True))
         fast = _STEER * _KEEN / (1.0 + _KEEN * far / _TURNING)
         return np.asarray(self.rates[0] * ((fast * missing).ravel() @ turn))
@@ -135,7 +172,7 @@ class Task(NamedTuple):
 
 @compiled
 def _stiffen(form: Any, scores: Any, by_score: Any, colours: Any, by_colour: Any) -> Any:
-    """Add squares of functions (n, k), each by what it costs (n,), to a quadratic form (k, k)."""
+    """Add squares of linear functions (n, k), times their costs, to a quadratic form (k, k)."""
     k = len(form)
     for which in range(2):
         rows, by = (scores, by_score) if which == 0 else (colours, by_colour)
@@ -149,9 +186,10 @@ def _stiffen(form: Any, scores: Any, by_score: Any, colours: Any, by_colour: Any
 
 @compiled
 def _least(stiff: Any, pull: Any, low: Any, high: Any, x: Any) -> Any:
-    """x (k,) within low and high becomes what makes x @ stiff @ x / 2 - pull @ x least.
+    """Minimise x @ stiff @ x / 2 - pull @ x within a box, by an active-set method.
 
-    Coordinates that would leave the box stay at its wall, and are not freed again.
+    The result is written to x (k,). Coordinates that would leave the box are fixed at its wall, and
+    are not freed again.
     """
     n = k = len(pull)
     a, b, at = np.empty((k, k)), np.empty(k), np.empty(k, np.int64)
@@ -195,16 +233,23 @@ def _least(stiff: Any, pull: Any, low: Any, high: Any, x: Any) -> Any:
 
 
 class _Aim(NamedTuple):
-    """What a velocity is to do: slopes (n, k) of moved scores, and how fast (n,) they shall
-    change."""
+    """Slopes (n, k) of moved scores, and the rates (n,) at which they shall change."""
 
     slopes: Float64
     rates: Float64
 
 
 class _Walls(NamedTuple):
-    """What a velocity must not pass: the box low, high (k,), and slopes (3, k) of what may not grow
-    by more than gaps (3,)."""
+    """Limits of a velocity: the box, and quantities that must not grow beyond a limit.
+
+    Parameters
+    ----------
+    low, high : (k,) float64
+    slopes : (3, k) float64
+        Slopes of `Around.walls`.
+    gaps : (3,) float64
+        How much these may still grow.
+    """
 
     low: Float64
     high: Float64
@@ -214,12 +259,12 @@ class _Walls(NamedTuple):
 
 @compiled
 def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any, out: Any) -> Any:
-    """Fill in the velocity (k,) at z (k,) that costs least by a form (k, k), of which a step of h
-    stays within the walls.
+    """Write to `out` (k,) the velocity at z (k,) that costs least by a form (k, k).
 
-    A moved score that does not change as fast as asked for costs `_WANTED`: so it has a greatest
-    speed, and fades where nothing leads on. If there are slopes `turn` (15, k) of colours, it is
-    made as fast as asked for where that is near, and no faster than can be followed.
+    A step of h stays within the walls. Missing the rate of a moved score costs `_WANTED`: so the
+    speed is limited, and the velocity fades where no direction changes the score. If there are
+    slopes `turn` (15, k) of colours, rates that are nearly met are met in full, and the speed is
+    limited to what an eye can follow.
     """
     k, count, three = len(z), len(aim.rates), len(walls.gaps)
     low, high, drawn, rates = np.empty(k), np.empty(k), np.empty(k), np.empty(count)
@@ -282,27 +327,33 @@ def _speed(form: Any, pull: Any, aim: Any, walls: Any, z: Any, h: Any, turn: Any
         for n in range(k):
             length += out[n] * out[n]
         over = max(shown / (_SHOWN * _SHOWN), length / (_FASTEST * _FASTEST))
-        slow = (1.0 + over**12) ** (-1.0 / 24.0)  # hardly any below the greatest speed
+        slow = (1.0 + over**12) ** (-1.0 / 24.0)  # close to 1 below the greatest speed
         for n in range(k):
             out[n] *= slow
 
 
 STEEP, WALLED, COLOURED = 1, 2, 4
-"""Why a move makes less way than asked for: flags of `Flow.why`."""
+"""Reasons why a move makes less way than asked for: flags that `Flow.why` adds up."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What a move came to.
+    """The outcome of a move.
 
     Attributes
     ----------
-    z : (k,) array
-    asked, reached : by trait, the change asked for and the change made
-    held : by held trait, how much it changed nevertheless
-    plausibility : as `TraitSpace.plausibility` of `z`
-    stopped : "" if all was reached, else why not
-    walled : whether it slid along a wall of the gamut, so that the way back may lead elsewhere
+    z : (k,) float64
+        Coordinates at its end.
+    asked, reached : mapping of float
+        By moved trait, the change of its score that was asked for, and the change made.
+    held : mapping of float
+        By held trait, the remaining change of its score.
+    plausibility : float
+        `TraitSpace.plausibility` of `z`, in [0, 1].
+    stopped : str
+        "" if all was reached, else the reason why not.
+    walled : bool
+        Whether the move slid along a wall of the gamut, so that the way back may lead elsewhere.
     """
 
     z: Float64
@@ -327,8 +378,21 @@ class Moved:
 
 
 class Part(NamedTuple):
-    """A part of a step: how much of the step is done at its end, the point (k,) and where moved
-    scores (n,) should be there; the form (k, k) and slopes (t, k) of scores at its middle."""
+    """A part of a step of the integration.
+
+    Attributes
+    ----------
+    done : float
+        How far its end is from the start of the step, in scores.
+    z : (k,) float64
+        Coordinates at its end.
+    planned : (n,) float64
+        Scores that moved traits should have there.
+    form : (k, k) float64
+        The quadratic form at its middle.
+    slopes : (t, k) float64
+        Slopes of all scores at its middle.
+    """
 
     done: float
     z: Float64
@@ -338,8 +402,22 @@ class Part(NamedTuple):
 
 
 class Knot(NamedTuple):
-    """Where a move is: the point (k,), where moved scores (n,) should be, all scores (t,),
-    whether it has met a wall, how fast (k,) it went last, and in what parts it came there."""
+    """A point of the computed curve.
+
+    Attributes
+    ----------
+    z : (k,) float64
+    planned : (n,) float64
+        Scores that moved traits should have there.
+    score : (t,) float64
+        Scores of all traits.
+    walled : bool
+        Whether a wall was met so far.
+    speed : (k,) float64 or None
+        The last velocity, a first guess for the next step.
+    parts : tuple of Part
+        The parts of the step that ends here.
+    """
 
     z: Float64
     planned: Float64
@@ -350,18 +428,21 @@ class Knot(NamedTuple):
 
 
 class Flow:
-    """A move from one point, found as far as it was asked for and kept: going on costs what is
-    new.
+    """The curve of a move from one point, integrated as far as it was asked for, and kept.
 
-    Every way is gone in the same steps from the same point, so that what lies at 0.5 does not
-    depend on whether 0.48 was looked at before.
+    Steps do not depend on how far was asked, so the point at 0.5 is the same whether 0.48 was asked
+    for before or not, and going further costs only the new steps.
 
     Parameters
     ----------
-    ground, task : as everywhere here
-    z : (k,) the start, within the box
-    end : how far the move may go
-    around : what there is to know at the start, or None
+    ground : Ground
+    task : Task
+    z : (k,) float64
+        The start, within the box.
+    end : float
+        How far the move may go, in scores.
+    around : Around, optional
+        `Ground.around` of `z`, if it is known.
     """
 
     def __init__(
@@ -380,11 +461,17 @@ class Flow:
 
     @property
     def score(self) -> Float64:
-        """All scores (t,) at the start."""
+        """Scores (t,) of all traits at the start."""
         return self._knots[0].score
 
     def to(self, way: float) -> Knot:
-        """Where the move is after some way, or where it ends before."""
+        """Integrate to a distance, and return the point there, or the end if that comes earlier.
+
+        Parameters
+        ----------
+        way : float
+            In scores, at least 0.
+        """
         while len(self._knots) * STEP <= min(way, self.end) + _HARDLY:
             self._go_on()
         way = min(way, self.end)
@@ -400,19 +487,21 @@ class Flow:
         return self._between(done, rest)
 
     def _go_on(self) -> None:
-        """Go a step further."""
+        """Integrate one step more."""
         knot, rates = self._knots[-1], self.task.rates
         found = self._advance(len(self._knots) - 1, STEP)
         made = float((found.planned - knot.planned) @ rates / (rates @ rates))
-        # at a kink a step may come to nothing, and the next one lead on
+        # at a kink one step may be idle, and the next one go on
         self._idle = self._idle + 1 if made < _STUCK * STEP else 0
         if self._idle == _PATIENCE:
             self.end = min(self.end, len(self._knots) * STEP)
         self._knots.append(found)
 
     def _between(self, place: int, h: float) -> Knot:
-        """Where the move is between a knot and the next: straight between ends of the parts of that
-        step, and scores are put right."""
+        """Interpolate between a knot and the next.
+
+        The curve is a polyline through the ends of the step's parts; then scores are corrected.
+        """
         knot, after = self._knots[place], self._knots[place + 1]
         walled = knot.walled or after.walled
         before, z, planned = 0.0, knot.z, knot.planned
@@ -426,10 +515,22 @@ class Flow:
                 point, score = self._put_right(point, score, aim, part.form, part.slopes, far)
                 return Knot(point, aim, score, walled)
             before, z, planned = part.done, part.z, part.planned
-        return after  # no further
+        return after  # the step ended early
 
     def why(self, way: float) -> int:
-        """Why it makes less than all of its way there: `STEEP`, `WALLED` and `COLOURED`, added."""
+        """Find why the move makes less way than asked for.
+
+        Parameters
+        ----------
+        way : float
+            Where, in scores.
+
+        Returns
+        -------
+        int
+            The sum of `STEEP` (scores depend too little on coordinates), `WALLED` (the gamut ends)
+            and `COLOURED` (colour and lightness are held) where they apply.
+        """
         z = self.to(way).z
         around, task, shares = self.ground.around(z), self.task, []
         for coloured, walled in ((False, False), (True, False), (True, True)):
@@ -446,8 +547,10 @@ class Flow:
         return why
 
     def _cost(self, around: Around, by_colour: Float64) -> Float64:
-        """The quadratic form (k, k) of what a velocity costs: how unlike the library's own
-        differences it is, and how fast it changes what had better stay."""
+        """Return the quadratic form (k, k) of the cost of a velocity.
+
+        It adds up the Mahalanobis distance and the squared changes that have a cost.
+        """
         form = self._base.copy()
         _stiffen(form, around.slopes, self._by_score, around.colours, by_colour)
         return form
@@ -461,15 +564,17 @@ class Flow:
         walled: bool = True,
         shown: bool = True,
     ) -> Float64:
-        """The field (k,) of the move at z (k,), of which a step of h shall stay within the walls;
-        what it is `shown` as, or what makes it fall short."""
+        """Return the velocity (k,) at z (k,), of which a step of h stays within the walls.
+
+        Without `shown` it is the plain minimum, by which `why` finds reasons.
+        """
         task, ground = self.task, self.ground
         low, high, gaps = ground.low, ground.high, task.limits - around.walls
         if not walled:
             low, high, gaps = low - math.inf, high + math.inf, gaps + math.inf
         turn = around.colours[TURN:HUES]
         aim = _Aim(around.slopes[task.moved], task.rates)
-        drawn = task.drawn(around.lab, turn) if task.steered else self._nowhere
+        drawn = task.drawn(around.lab, turn) if task.costs.steered else self._nowhere
         speed = np.empty(len(z))
         _speed(
             form, drawn, aim, _Walls(low, high, around.steep, gaps), z, h,
@@ -478,12 +583,12 @@ class Flow:
         return speed
 
     def _advance(self, place: int, h: float) -> Knot:
-        """A step of h from a knot.
+        """Integrate a step of h from a knot.
 
-        The midpoint rule (Hairer, Norsett & Wanner 1993, II.1), in parts where it is fast, or where
-        scores come out other than the field says; then what is off in them is put right along the
-        field's own directions. The middle is guessed by the velocity of the part before, which
-        saves half of the looks at the field; where that misleads, by the velocity here.
+        The midpoint rule (Hairer, Norsett & Wanner 1993, II.1), in parts where the velocity is high
+        or scores differ from what it predicts; then the scores' remaining errors are corrected. The
+        midpoint is predicted with the velocity of the previous part, which halves the number of
+        evaluations; where that fails, with the velocity here.
         """
         ground, task, some_held = self.ground, self.task, len(self.task.held) > 0
         z, planned, have, walled, first, _ = self._knots[place]
@@ -504,7 +609,7 @@ class Flow:
             slopes = around.slopes[task.moved]
             made = step * (slopes @ speed)
             aim, after = planned + made, self._inside(z, speed, step)
-            if task.steered:  # the colour may draw it on faster than asked for
+            if task.costs.steered:  # the drawn colour may change scores faster than asked for
                 whole = planned + step * task.rates
                 aim = np.where(task.rates > 0.0, np.minimum(aim, whole), np.maximum(aim, whole))
             score, _, mended = ground.look(after)
@@ -520,7 +625,7 @@ class Flow:
                     step *= 0.5
                     at = self._inside(z, first, 0.5 * step)
                 continue
-            # what is too far off to be put right: it goes on from there
+            # scores too far off to be corrected: the curve goes on from where they are
             lost = np.abs(aim - score[task.moved]) > _LOST
             aim = np.where(lost, score[task.moved], aim)
             far = step * _most(speed)
@@ -532,7 +637,7 @@ class Flow:
                     first, at, guessed = None, z, False
                     continue
                 if step <= h / _PARTS:
-                    break  # no further: what is held would not stay, or scores would fall
+                    break  # the move ends: held scores would change, or moved ones go back
                 step *= 0.5
                 at = self._inside(z, first, 0.5 * step)
                 continue
@@ -546,7 +651,7 @@ class Flow:
             parts.append(Part(done, z, planned, form, around.slopes))
             if h - done <= _HARDLY:
                 break
-            # where a part had to be short the next one will be, too
+            # where one part had to be short, so will the next
             wary = 2.0 * step
             length = math.sqrt(first @ first)
             step = min(h - done, wary, _LONG / max(length, 1e-30))
@@ -562,11 +667,12 @@ class Flow:
         slopes: Float64,
         far: float,
     ) -> tuple[Float64, Float64]:
-        """A point near z (k,) of scores (t,) where moved scores are at their aim (n,) and held
-        ones where they were, and its scores.
+        """Correct the scores of a point near the curve.
 
-        Along the cheapest way by a form (k, k), with slopes (t, k) of scores, and in no coordinate
-        by more than half as far as the part of a step goes: where slopes are faint it would leap.
+        Newton steps bring moved scores to their aim (n,) and held ones to their start, along the
+        cheapest way by a form (k, k), with slopes (t, k) of scores. No coordinate changes by more
+        than half as far as the part of a step goes: where slopes are faint the correction would
+        jump. Returns the point (k,) and its scores (t,).
         """
         ground, task = self.ground, self.task
         off = self._off(aim, score)
@@ -588,13 +694,13 @@ class Flow:
         return z, score
 
     def _off(self, aim: Float64, score: Float64) -> float:
-        """How far moved scores (t,) are off their aim (n,), or held ones off where they were."""
+        """Return the greatest error of moved scores against their aim, and of held ones."""
         task = self.task
         off = _most(aim - score[task.moved])
         return max(off, _most(self._kept - score[task.held])) if len(task.held) else off
 
     def _inside(self, z: Float64, speed: Float64, h: float) -> Float64:
-        """z + h * speed, no further than the box."""
+        """Return z + h * speed, clipped to the box."""
         out = h * speed
         out += z
         np.maximum(out, self.ground.low, out=out)
@@ -602,5 +708,5 @@ class Flow:
 
 
 def _most(values: Float64) -> float:
-    """The greatest amount of a few numbers, 0 of none."""
+    """Return the greatest absolute value, 0 if there is none."""
     return max(map(abs, values.tolist()), default=0.0)

@@ -1,4 +1,9 @@
-"""What scores are read off, and how they change from place to place."""
+"""Scores of traits and their slopes, computed from coordinates.
+
+A few cells of a table are decoded to readings: RGB values of f or of albedos. Formulas turn
+readings into physical descriptors (`traitbrdf.reflectance.descriptors`), grades say how common a
+descriptor's value is in the library, and a score is a weighted sum of grades.
+"""
 
 from __future__ import annotations
 
@@ -21,32 +26,35 @@ from traitbrdf.reflectance.descriptors import (
 from traitbrdf.space.logmap import FLOOR, OPPONENT
 
 Float64 = NDArray[np.float64]
-_TINGED = 0.15  # log RGB: less is grey
-THIN = 0.1  # of log density, beside what decoding mends
-_SMOOTH = 0.12  # of a descriptor's range: over which its distribution is smoothed
-_POWER = 48  # of the norm that stands for the greatest albedo: smooth, and 5 % above at most
-_SMALL = 1e-5  # a step along a coordinate that shows slopes
+_TINGED = 0.15  # distance of log RGB from grey below which a colour counts as grey
+THIN = 0.1  # scales log density so that it is comparable with log f in `Around.walls`
+_SMOOTH = 0.12  # kernel width of smoothed distributions, in shares of a descriptor's range
+_POWER = 48  # p-norm that stands for the greatest albedo: smooth, and at most 5 % above it
+_SMALL = 1e-5  # step of forward differences along a coordinate, in standard deviations
 
-# What is compiled are loops over arrays that are given, called from Python one by one: a compiled
-# function that calls others is compiled together with all of them, and takes as much longer. The
-# lock of Python is kept meanwhile: they take microseconds, and getting it back can take more.
+# Compiled functions are loops over given arrays that Python calls one by one: one that calls others
+# would be compiled together with all of them, which takes longer. They keep Python's lock, since
+# they run for microseconds, and getting the lock back can take longer than that.
 compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 
 
 def _plain(array: Any) -> Any:
-    """A copy that can be written to, of one layout: for each other one, code is compiled anew."""
+    """Copy to a writable array in C order: numba compiles code anew for each other layout."""
     return np.array(array, np.int64 if array.dtype.kind == "i" else np.float64, order="C")
 
 
 class Density(NamedTuple):
-    """Where the library is: a mixture of Gaussians, one for each family and a wide one.
+    """Density of the library's members: a mixture of Gaussians, one for each family and one of all.
 
     Parameters
     ----------
-    means : (c, k)
-    whiten : (c, k, k), lower factors: whiten[i] @ (z - means[i]) has unit covariance
-    logs : (c,) log of weight over volume
-    known : (101,) log densities of the library's percentiles 0 to 100
+    means : (c, k) float64
+    whiten : (c, k, k) float64
+        Lower triangular factors: ``whiten[i] @ (z - means[i])`` has unit covariance.
+    logs : (c,) float64
+        Log of a component's weight over its volume.
+    known : (101,) float64
+        Log densities of the library's percentiles 0 to 100.
     """
 
     means: Float64
@@ -56,6 +64,14 @@ class Density(NamedTuple):
 
     @classmethod
     def fit(cls, z: Float64, families: Sequence[str]) -> Density:
+        """Fit a Gaussian to each family, and one to all members.
+
+        Parameters
+        ----------
+        z : (n, k) float64
+            Coordinates of the members.
+        families : n str
+        """
         kinds = np.asarray(families)
         k = z.shape[1]
         names = np.unique(kinds)
@@ -65,7 +81,8 @@ class Density(NamedTuple):
         groups = [(0.95 / len(names), z[kinds == kind]) for kind in names] + [(0.05, z)]
         means, whiten, logs = [], [], []
         for weight, members in groups:
-            # a family's own shape, drawn towards that of all: 60 members say little of 24 axes
+            # a family's covariance is shrunk towards the mean one: 60 members do not determine 24
+            # axes
             cov = 0.6 * np.cov(members.T, ddof=0) + 0.4 * within + 1e-2 * np.eye(k)
             factor = np.linalg.inv(np.linalg.cholesky(cov))
             means.append(members.mean(axis=0))
@@ -76,11 +93,27 @@ class Density(NamedTuple):
         return found._replace(known=np.percentile(own, np.arange(101.0)))
 
     def log(self, z: Float64) -> float:
-        """log density at z (k,), to a constant."""
+        """Return the log density at a point, up to a constant.
+
+        Parameters
+        ----------
+        z : (k,) float64
+        """
         return self.slope(z)[0]
 
     def slope(self, z: Float64) -> tuple[float, Float64]:
-        """log density at z (k,) and its gradient (k,)."""
+        """Return the log density at a point and its gradient.
+
+        Parameters
+        ----------
+        z : (k,) float64
+
+        Returns
+        -------
+        float
+            Up to a constant.
+        (k,) float64
+        """
         uphill = np.zeros(len(z))
         pulls, each = np.empty(self.means.shape), np.empty(len(self.means))
         found = _log_density(_plain(z), self.means, self.whiten, self.logs, pulls, each, uphill)
@@ -91,8 +124,10 @@ class Density(NamedTuple):
 def _log_density(
     z: Any, means: Any, whiten: Any, logs: Any, pulls: Any, each: Any, uphill: Any
 ) -> Any:
-    """log density at z (k,); its gradient is added to `uphill` (k,). `pulls` (c, k) and `each` (c,)
-    are room to reckon in."""
+    """Return the log density at z (k,), and add its gradient to `uphill` (k,).
+
+    `pulls` (c, k) and `each` (c,) are work arrays.
+    """
     count, k = means.shape
     top = -math.inf
     for c in range(count):
@@ -111,7 +146,7 @@ def _log_density(
         total += each[c]
     for c in range(count):
         share = each[c] / total
-        if share > 1e-20:  # less than that is lost in rounding
+        if share > 1e-20:  # smaller shares are lost in rounding
             for i in range(k):
                 for j in range(i + 1):
                     uphill[j] -= share * pulls[c, i] * whiten[c, i, j]
@@ -119,12 +154,15 @@ def _log_density(
 
 
 class Grades(NamedTuple):
-    """How common a descriptor's value is in the library, as a number of standard deviations.
+    """Grades of descriptors: how common a value is in the library, in standard deviations.
 
     Parameters
     ----------
-    names : descriptors
-    at, grade : (d, m) values and their grades, both ascending; straight on beyond the ends
+    names : d str
+        Descriptors.
+    at, grade : (d, m) float64
+        Values and their grades, both ascending along each row. Grades are linear between them, and
+        extrapolated linearly beyond the ends.
     """
 
     names: tuple[str, ...]
@@ -133,10 +171,18 @@ class Grades(NamedTuple):
 
     @classmethod
     def fit(cls, values: Mapping[str, ArrayLike], knots: int = 129) -> Grades:
-        """Normal scores of smoothed distributions (kernel estimates, Silverman 1986, chapter 2).
+        """Compute normal scores of smoothed distributions.
 
-        Smoothed, since many members share a value (no tint at all): as steep as a step there, a
-        trait would leap.
+        The distributions are kernel estimates (Silverman 1986, chapter 2). Many members share a
+        value (no tint at all, for example): without smoothing the grade would have a step there,
+        and moves of a trait would jump.
+
+        Parameters
+        ----------
+        values : mapping of (n,) array_like
+            By descriptor, its value for each member of the library.
+        knots : int
+            Number of values at which grades are kept.
         """
         from scipy.special import ndtr, ndtri
 
@@ -151,7 +197,17 @@ class Grades(NamedTuple):
         return cls(tuple(values), np.array(at), np.array(grade))
 
     def of(self, descriptors: Float64) -> Float64:
-        """Grades (..., d) of all of `descriptors.DESCRIPTORS` (..., n), in their order."""
+        """Grade descriptors.
+
+        Parameters
+        ----------
+        descriptors : (..., n) float64
+            Values of all of `traitbrdf.reflectance.descriptors.DESCRIPTORS`, in their order.
+
+        Returns
+        -------
+        (..., d) float64
+        """
         used = _places(self.names)
         flat = np.ascontiguousarray(descriptors.reshape(-1, descriptors.shape[-1]), np.float64)
         found = np.empty((len(flat), len(used)))
@@ -163,13 +219,13 @@ _ORDER = {name: i for i, name in enumerate(DESCRIPTORS)}
 
 
 def _places(names: Sequence[str]) -> NDArray[np.int64]:
-    """Where descriptors stand among all."""
+    """Return the index of each descriptor among `DESCRIPTORS`."""
     return np.array([_ORDER[name] for name in names], np.int64)
 
 
 @compiled
 def _interpolate(values: Any, used: Any, at: Any, grade: Any, out: Any) -> Any:
-    """Columns `used` of values (m, n), each along its own knots, and straight on beyond them."""
+    """Interpolate columns `used` of values (m, n), each along its own knots, into `out` (m, d)."""
     last = at.shape[1] - 1
     end = max(last // 8, 1)
     for j in range(len(used)):
@@ -193,15 +249,19 @@ def _interpolate(values: Any, used: Any, at: Any, grade: Any, out: Any) -> Any:
 
 
 class Readings(NamedTuple):
-    """What `descriptors.READINGS` need of an embedding: few cells.
+    """How readings (`traitbrdf.reflectance.descriptors.READINGS`) are computed from few cells.
 
     Parameters
     ----------
-    rows, mean : (3, cells, k) and (cells,), log(f + FLOOR) of a channel: rows @ z + mean
-    weights : (readings, cells)
-    columns : (n, c) int64, the cells from the middle to the rim of the highlight, for each theta_d
-        that the profile has
-    energy : (angles, cells), directional albedos at angles from 0 to 80 degrees
+    rows : (3, cells, k) float64
+    mean : (cells,) float64
+        log(f + FLOOR) of a channel is ``rows[channel] @ z + mean``.
+    weights : (readings, cells) float64
+        Each reading is a weighted sum of f.
+    columns : (n, c) int64
+        Cells from the middle to the rim of the highlight, for each of c values of theta_d.
+    energy : (angles, cells) float64
+        Weights of directional albedos at angles from 0 to 80 degrees.
     """
 
     rows: Float64
@@ -212,16 +272,20 @@ class Readings(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """`Readings` without the zeros, and the albedos after them as readings more.
+    """`Readings` in sparse form, with the albedos as further readings.
 
     Parameters
     ----------
-    rows, mean, columns : as `Readings`
-    turned : (3, k, cells) of `OPPONENT` axes in the place of channels, where most are zeros
-    spans : (3, 2), the coordinates that each axis depends on: from and to
-    starts : (readings + angles + 1,) where the cells of each begin in the others
-    which, weights : (n,) each, cells and what they weigh
-    angles : int64
+    rows, mean, columns : as for `Readings`
+    turned : (3, k, cells) float64
+        `rows` on `OPPONENT` axes instead of channels, where most entries are zero.
+    spans : (3, 2) int64
+        The first coordinate that each axis depends on, and the one after the last.
+    starts : (readings + angles + 1,) int64
+        Where the cells of each reading begin in `which` and `weights`.
+    which, weights : (n,) int64 and float64
+        Cells and their weights.
+    angles : int
     """
 
     rows: Float64
@@ -253,9 +317,18 @@ class _Cells(NamedTuple):
         )  # fmt: skip
 
     def near(self, z: Float64, sloped: bool) -> tuple[Float64, Float64, Float64, Float64]:
-        """Readings (readings, 3) at a point (k,) and their slopes (readings, 3, k); what decoding
-        mends there (2,) and its slopes (2, k): by how much (log f) the middle of the highlight is
-        darker than what is around it, and the log of the greatest albedo. No slopes are zeros."""
+        """Compute readings and constraints at a point z (k,).
+
+        Returns
+        -------
+        readings : (readings, 3)
+        slopes : (readings, 3, k); no rows if not `sloped`
+        mended : (2,)
+            What decoding will correct: by how much the middle of the highlight is darker than its
+            brightest ring (log f), and the log of the greatest albedo.
+        steep : (2, k)
+            Slopes of `mended`; zeros if not `sloped`.
+        """
         count, k = len(self.starts) - 1, len(z)
         value, slopes = np.zeros((count, 3)), np.zeros((count if sloped else 0, 3, k))
         mended, steep = np.zeros(2), np.zeros((2, k))
@@ -276,11 +349,13 @@ def _near(
     mended: Any,
     steep: Any,
 ) -> Any:
-    """Add up what `_Cells.near` gives, of readings and albedos; slopes if there is room for them.
-    `raised` and `source` (3, cells) become f + FLOOR, and the cells of which it is."""
+    """Compute what `_Cells.near` returns, and slopes if `slopes` has rows.
+
+    `raised` (3, cells) becomes f + FLOOR, and `source` (3, cells) the cell whose slope it has.
+    """
     rows, columns = cells.rows, cells.columns
     k, count, first = len(z), len(value), len(value) - cells.angles
-    three = value.shape[1]  # no constant: loops that are unrolled take longer to compile
+    three = value.shape[1]  # not a constant: unrolled loops take longer to compile
     for a in range(three):
         for n in range(len(cells.mean)):
             raised[a, n] = 0.0
@@ -296,8 +371,8 @@ def _near(
     for c in range(three):
         for n in range(len(cells.mean)):
             source[c, n] = n
-            # exp as 64th power of its series: a library's is called for each cell alone, which
-            # was most of the work
+            # exp as the 64th power of its series: one call of the library's exp for each cell
+            # took most of the time
             t = min(raised[c, n], 30.0) * (1 / 64)
             e = 1.0 + t * (1 / 11 + t * (1 / 132 + t * (1 / 1716)))
             e = 1.0 + t * (1 / 8 + t * (1 / 72 + t * (1 / 720) * e))
@@ -309,7 +384,7 @@ def _near(
             e *= e
             e *= e
             raised[c, n] = e * e
-    # the middle of the profile is darker than its brightest by
+    # by how much the middle of the highlight is darker than its brightest ring
     brightest, most, middle = 0, 0.0, 0.0
     for i in range(len(columns)):
         light = 0.0
@@ -329,7 +404,7 @@ def _near(
                 down = LUMINANCE[c] * raised[c, dark] / middle
                 for m in range(k):
                     steep[0, m] += up * rows[c, bright, m] - down * rows[c, dark, m]
-    # no hole in the highlight: as high as what follows, of which it then has the slope too
+    # fill holes in the highlight: a cell takes the value, and the slope, of a brighter later one
     for c in range(three):
         for j in range(columns.shape[1]):
             for i in range(len(columns) - 2, -1, -1):
@@ -361,7 +436,7 @@ def _near(
                 if part > 1e-3:
                     for m in range(k):
                         steep[1, m] += part / max(value[i, c], 1e-9) * slopes[i, c, m]
-    if whole > 1.0:  # no more light than there was
+    if whole > 1.0:  # decoding divides f by an albedo above 1
         for i in range(first):
             for c in range(three):
                 value[i, c] /= whole
@@ -371,29 +446,34 @@ def _near(
                         slopes[i, c, m] = (slopes[i, c, m] - value[i, c] * top) / whole
 
 
-PALE = 5.0  # C*ab: paler colours have no hue to speak of
+PALE = 5.0  # CIELAB chroma below which a hue is hardly visible
 
 SURFACES = ("albedo 10", "albedo", "albedo 60", "body", "side")
-"""Readings whose colour a person sees: all reflected light from three angles, the body, and the
-body lit from the side."""
+"""Readings whose colour a person sees: all light reflected at 10, 30 and 60 degrees, the body (what
+lies below the highlight), and the body lit from the side.
+"""
 
 BODY_OF = SURFACES.index("body")
 _PEAK_AT = READINGS.index("profile 0")
 _SEEN_AT = np.array([READINGS.index(name) for name in SURFACES])
 
-# the body is read as f, not as an albedo
+# factors that turn readings into albedos: the body is read as f
 _WHOLE = np.array([[1.0], [1.0], [1.0], [math.pi], [math.pi]])
 
-# rows of what `_colour_rows` gives: slopes of L*, a* and b* of each surface; of each, what changes
-# its hue, what gives a hue to what is grey, and what changes its chroma beside lightness; what
-# changes the hue of the lobe; what changes L* of the body otherwise than that of all light
+# where rows of `_colour_rows` begin: gradients of L*, a* and b* of each surface; of its hue in
+# degrees, of the hue that a grey surface gains, and of its chroma apart from lightness; of the hue
+# of the lobe; of L* of the body minus that of all light. COLOURS is their number.
 TURN, HUES, GREYS, CHROMAS, LOBES, BESIDE, COLOURS = 0, 15, 20, 30, 40, 43, 44
 
 
 @compiled
 def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
-    """Fill in CIELAB (5, 3) of `SURFACES` and how it changes, functions (COLOURS, k) of a
-    velocity, of readings (readings, 3) and their slopes (readings, 3, k)."""
+    """Fill in how colours change with the coordinates.
+
+    `lab` (5, 3) becomes CIELAB of `SURFACES`, and `rows` (COLOURS, k) gradients of the quantities
+    that `TURN` to `BESIDE` index. Inputs are readings (readings, 3) and their slopes `by_z`
+    (readings, 3, k).
+    """
     k, three = by_z.shape[2], by_z.shape[1]
     f, by = np.empty(lab.shape[1]), np.empty(lab.shape[1])
     for i in range(len(_SEEN_AT)):
@@ -408,7 +488,7 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
         light, a, b = 116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])
         lab[i, 0], lab[i, 1], lab[i, 2] = light, a, b
         chroma = a * a + b * b + PALE * PALE
-        degrees = 180.0 / math.pi / chroma  # fewer where there is hardly a hue
+        degrees = 180.0 / math.pi / chroma  # fades where chroma is low
         grey = 180.0 / math.pi * PALE * PALE / (chroma * math.sqrt(chroma))
         for n in range(k):
             red, green, blue = by_z[at, 0, n], by_z[at, 1, n], by_z[at, 2, n]
@@ -422,11 +502,11 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
             rows[HUES + i, n] = degrees * (a * by_b - b * by_a)
             rows[GREYS + 2 * i, n] = grey * by_a
             rows[GREYS + 2 * i + 1, n] = grey * by_b
-            # a colour that grows lighter keeps its ratio of a* to L* + 16
+            # a colour that only grows lighter keeps the ratio of a* to L* + 16
             rows[CHROMAS + 2 * i, n] = by_a - a / (light + 16.0) * by_light
             rows[CHROMAS + 2 * i + 1, n] = by_b - b / (light + 16.0) * by_light
-    # a lobe may take on the hue of all light, or lose it, but gets no other. Hues are logarithms
-    # of red over blue and of green over both
+    # a lobe may take on the hue of all light, or lose it, but no other hue. Hues here are the
+    # logarithms of red over blue and of green over both
     x = y = along_x = along_y = 0.0
     for c in range(three):
         log = math.log(max(readings[_SEEN_AT[1], c], 0.0) + 1e-2)
@@ -451,8 +531,10 @@ def _colour_rows(readings: Any, by_z: Any, lab: Any, rows: Any) -> Any:
 
 @compiled
 def _around_readings(readings: Any, by_z: Any, steps: Any) -> Any:
-    """Fill in readings (k + 1, readings, 3) a small step along each coordinate away, the first of
-    none, by their slopes (readings, 3, k)."""
+    """Fill in readings (k + 1, readings, 3) here and at a small step along each coordinate.
+
+    They are extrapolated with slopes (readings, 3, k).
+    """
     for i in range(len(readings)):
         for c in range(3):
             steps[0, i, c] = readings[i, c]
@@ -462,8 +544,11 @@ def _around_readings(readings: Any, by_z: Any, steps: Any) -> Any:
 
 @compiled
 def _weigh(graded: Any, weights: Any, normals: Any, zero: Any, z: Any, score: Any, by: Any) -> Any:
-    """Fill in scores (t,) of graded descriptors (m, d), and if there are those a small step along
-    each coordinate away, slopes (t, k)."""
+    """Fill in scores (t,) and their slopes (t, k).
+
+    `graded` (m, d) are graded descriptors here and, if slopes are wanted, at a small step along
+    each coordinate (m = k + 1); slopes are forward differences.
+    """
     for t in range(len(score)):
         here = -zero[t]
         for n in range(len(z)):
@@ -480,22 +565,32 @@ def _weigh(graded: Any, weights: Any, normals: Any, zero: Any, z: Any, score: An
 
 
 class Optics(NamedTuple):
-    """What lets scores be read off descriptors: where they are read, and how they are graded."""
+    """How scores are computed from descriptors.
+
+    Parameters
+    ----------
+    readings : Readings
+        The cells that descriptors need.
+    grades : Grades
+    """
 
     readings: Readings
     grades: Grades
 
 
 class Around(NamedTuple):
-    """What moves need to know of a point.
+    """Scores, colours and constraints at a point, with their slopes.
 
     Parameters
     ----------
-    score, slopes : (t,) and (t, k)
-    lab : (5, 3) CIELAB of `SURFACES`
-    colours : (COLOURS, k), how colours change, as `_colour_rows`
-    walls, steep : (3,) and (3, k), what may not grow beyond a limit, and its slopes: what decoding
-        mends, as `_Cells.near`, and how `unlikely` the point is
+    score, slopes : (t,) and (t, k) float64
+    lab : (5, 3) float64
+        CIELAB of `SURFACES`.
+    colours : (COLOURS, k) float64
+        Gradients of colours, as `_colour_rows` orders them.
+    walls, steep : (3,) and (3, k) float64
+        Values that a move must keep below limits, and their slopes: the depth of a hole in the
+        highlight (log f), the log of the greatest albedo, and how `unlikely` the point is.
     """
 
     score: Float64
@@ -507,23 +602,65 @@ class Around(NamedTuple):
 
 
 def unlikely(log: Any) -> Any:
-    """How unlikely a point is of which the log density, or its slope, is known, on the scale of
-    `Around.walls`."""
-    return -THIN * log
-
-
-class Ground(NamedTuple):
-    """What scores and their slopes are had of.
+    """Scale a log density, or its slope, to what `Around.walls` holds.
 
     Parameters
     ----------
-    cells : None if scores are not read off descriptors
-    used : (d,) places of the graded descriptors among all
-    at, grade : as of `Grades`
-    weights, normals, zero : (t, d), (t, k) and (t,), scores: weights @ grades + normals @ z - zero
-    stiffness : (k, k) metric of moves
-    low, high : (k,)
-    density : None if it is not known where the library is
+    log : float or array
+
+    Returns
+    -------
+    float or array
+        The greater, the less likely.
+    """
+    return -THIN * log
+
+
+class Box(NamedTuple):
+    """The gamut box: the range of the library's coordinates.
+
+    Parameters
+    ----------
+    low, high : (k,) float64
+    """
+
+    low: Float64
+    high: Float64
+
+
+class Scoring(NamedTuple):
+    """Coefficients of all scores: ``weights @ grades + normals @ z - zero``.
+
+    Parameters
+    ----------
+    weights : (t, d) float64
+    normals : (t, k) float64
+    zero : (t,) float64
+    """
+
+    weights: Float64
+    normals: Float64
+    zero: Float64
+
+
+class Ground(NamedTuple):
+    """Everything from which scores, colours and constraints are computed, as arrays.
+
+    Parameters
+    ----------
+    cells : _Cells or None
+        None if scores do not read descriptors.
+    used : (d,) int64
+        Index of each graded descriptor among `DESCRIPTORS`.
+    at, grade : (d, m) float64
+        As for `Grades`.
+    weights, normals, zero : (t, d), (t, k) and (t,) float64
+        As for `Scoring`.
+    stiffness : (k, k) float64
+        Inverse covariance: the metric in which moves are short (Mahalanobis distance).
+    low, high : (k,) float64
+        The gamut box.
+    density : Density or None
     """
 
     cells: _Cells | None
@@ -541,18 +678,24 @@ class Ground(NamedTuple):
     @classmethod
     def of(
         cls,
-        optics: Optics | None,
-        weights: Float64,
-        normals: Float64,
-        zero: Float64,
-        span: Float64,
+        scoring: Scoring,
         stiffness: Float64,
-        low: Float64,
-        high: Float64,
-        density: Density | None,
+        box: Box,
+        optics: Optics | None = None,
+        density: Density | None = None,
     ) -> Ground:
-        """`weights` and `normals` give raw scores, `zero` (t,) is that of score 0, and `span` (t,)
-        what lies between scores 0 and 1."""
+        """Collect the arrays, each in one layout.
+
+        Parameters
+        ----------
+        scoring : Scoring
+        stiffness : (k, k) float64
+            Metric of moves, an inverse covariance.
+        box : Box
+        optics : Optics, optional
+            Left out if no score reads descriptors.
+        density : Density, optional
+        """
         none = np.zeros((0, 0))
         names, at, grade = optics.grades if optics else ((), none, none)
         return cls(
@@ -560,26 +703,55 @@ class Ground(NamedTuple):
             _places(names),
             _plain(at),
             _plain(grade),
-            _plain(weights / span[:, None]),
-            _plain(normals / span[:, None]),
-            zero / span,
+            _plain(scoring.weights),
+            _plain(scoring.normals),
+            scoring.zero,
             _plain(stiffness),
-            low,
-            high,
+            box.low,
+            box.high,
             density and Density(*map(_plain, density)),
         )
 
     def seen(self, z: Float64) -> Float64:
-        """CIELAB (5, 3) of `SURFACES` at z (k,)."""
+        """Return CIELAB of `SURFACES` at a point.
+
+        Parameters
+        ----------
+        z : (k,) float64
+
+        Returns
+        -------
+        (5, 3) float64
+        """
         return cielab(self.look(z)[1][_SEEN_AT] * _WHOLE)
 
     def slopes(self, z: Float64) -> Float64:
-        """Slopes (t, k) of all scores at z (k,)."""
+        """Return the slopes of all scores at a point.
+
+        Parameters
+        ----------
+        z : (k,) float64
+
+        Returns
+        -------
+        (t, k) float64
+        """
         return self.around(z).slopes
 
     def look(self, z: Float64) -> tuple[Float64, Float64, Float64]:
-        """Scores (t,) at z (k,), readings (readings, 3) and what decoding mends (2,), as
-        `_Cells.near`; zeros where nothing is read."""
+        """Return scores, readings and constraints at a point, without slopes.
+
+        Parameters
+        ----------
+        z : (k,) float64
+
+        Returns
+        -------
+        score : (t,)
+        readings : (readings, 3); zeros if no descriptors are read
+        mended : (2,)
+            The first two of `Around.walls`.
+        """
         if self.cells is None:
             return self.normals @ z - self.zero, np.zeros((len(READINGS), 3)), np.zeros(2)
         point = _plain(z)
@@ -590,7 +762,12 @@ class Ground(NamedTuple):
         return score, readings, mended
 
     def around(self, z: Float64) -> Around:
-        """What there is to know at z (k,)."""
+        """Return scores, colours and constraints at a point, with their slopes.
+
+        Parameters
+        ----------
+        z : (k,) float64
+        """
         k, point = len(z), _plain(z)
         lab, colours = np.zeros((len(_SEEN_AT), 3)), np.zeros((COLOURS, k))
         walls, steep = np.zeros(3), np.zeros((3, k))
@@ -602,7 +779,7 @@ class Ground(NamedTuple):
             score = self.normals @ point - self.zero
             return Around(score, self.normals, lab, colours, walls, steep)
         readings, by_z, walls[:2], steep[:2] = self.cells.near(point, True)
-        # formulas of a few numbers: cheaper once more than their slopes
+        # evaluating the formulas k + 1 times is cheaper than their analytic slopes
         steps = np.empty((k + 1, len(READINGS), 3))
         _around_readings(readings, by_z, steps)
         score, slopes = np.empty(len(self.zero)), np.empty((len(self.zero), k))
@@ -612,7 +789,16 @@ class Ground(NamedTuple):
         return Around(score, slopes, lab, colours, walls, steep)
 
     def grades(self, z: Float64) -> Float64:
-        """Grades (..., d) of what is read at z (..., k), as decoding mends it."""
+        """Return graded descriptors at points.
+
+        Parameters
+        ----------
+        z : (..., k) float64
+
+        Returns
+        -------
+        (..., d) float64, in standard deviations
+        """
         if self.cells is None:
             return np.zeros((*z.shape[:-1], 0))
         points = _plain(z).reshape(-1, z.shape[-1])
@@ -622,7 +808,7 @@ class Ground(NamedTuple):
         return self._graded(readings).reshape(*z.shape[:-1], len(self.used))
 
     def _graded(self, readings: Float64) -> Float64:
-        """Grades (m, d) of readings (m, readings, 3)."""
+        """Return graded descriptors (m, d) of readings (m, readings, 3)."""
         described = np.empty((len(readings), len(DESCRIPTORS)))
         formulas(readings, described)
         found = np.empty((len(readings), len(self.used)))

@@ -1,169 +1,77 @@
-"""Traits: directions in the embedding that mean something to a designer.
+"""Traits: words with which a designer describes and moves materials.
 
 A trait is a smooth score on coordinates. The shipped ones grade physical descriptors
-(`traitbrdf.reflectance.descriptors`) by how common their values are among the members of the
-library, and add them up; they are had of the coordinates by the few cells that they read. Straight
-traits are the normal of a linear support vector machine between members that have the trait and
-members that do not, or the difference of their means (Matusik et al. 2003). Scores are scaled so
-that the 10th percentile of the library has 0 and the 90th has 1.
+(`traitbrdf.reflectance.descriptors`) by how common their values are in the library, and add the
+grades up; a few decoded cells suffice to compute them. Straight traits are linear functions of the
+coordinates (Matusik et al. 2003). Scores are scaled so that the library's 10th percentile has 0 and
+its 90th has 1.
 
-A move changes scores by given amounts along a path, exactly, and holds others
-(`traitbrdf.space.moves`). It ends where the library ends: at the wall of the box, or
-where no member is near (`Density`).
+A move changes scores by given amounts along a curve and holds others (`traitbrdf.space.moves`). It
+ends at the wall of the gamut box, or where no member of the library is near (`Density`).
 """
 
 from __future__ import annotations
 
 import functools
-import io
 import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from traitbrdf.formats.files import artifact, unknown_name
 from traitbrdf.reflectance.descriptors import descriptors
+from traitbrdf.space.definitions import (
+    Definition,
+    Labelled,
+    Statistics,
+    as_labels,
+    rank_correlations,
+    stacked,
+    straight,
+    with_one_more,
+)
 from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.explanation import Explanation
+from traitbrdf.space.holding import COLOURS, GROUPS, LIGHT, held_costs
 from traitbrdf.space.library import Library, default_embedding, default_library
 from traitbrdf.space.moves import COLOURED, STEEP, STEP, WALLED, Flow, Moved, Task
-from traitbrdf.space.scores import PALE, Around, Density, Grades, Ground, Optics, Readings, unlikely
-
-if TYPE_CHECKING:
-    from traitbrdf.reflectance.brdf import TabulatedBRDF
-    from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.space.scores import (
+    Around,
+    Box,
+    Density,
+    Grades,
+    Ground,
+    Optics,
+    Readings,
+    Scoring,
+    unlikely,
+)
 
 Float64 = NDArray[np.float64]
-
-COLOURS = frozenset(("red", "green", "blue", "gold"))
-"""Traits that are colours: their moves hold none unless told to."""
-
-LIGHT = frozenset(("bright", "diffuse", "specular", "silver", "gold", "dusty", "ceramic"))
-"""Traits that are about how light a thing is: their moves hold no lightness unless told to.
-
-"bright" is lightness itself; "diffuse" and "specular" are amounts of reflected light; silver, gold
-and ceramic are light, and dust is paler than what it lies on.
-"""
-
-PALING = frozenset(("dusty", "acrylic", "tint", "silver"))
-"""Traits that say how saturated a thing is: where their moves hold colour, they hold its hue."""
-
-STEERED = MappingProxyType({"gold": (75.0, 0.06, 0.42), "silver": (80.0, 0.0, 0.0)})
-"""Traits that lead towards a colour: its L*, and its a* and b* for an L* + 16 of one. Gold's are
-near those of its reflectance at normal incidence (Johnson & Christy 1972: 91, 0.02, 0.31), and
-those of darker, warmer alloys."""
-
-KEEPS_BODY = frozenset(("shiny", "glossy", "strength", "sharpness", "hard", "greasy", "plastic"))
-"""Traits of the highlight: their moves keep the body below it as far as that is possible."""
-
-GROUPS = ("colour", "color", "lightness", "body")
-"""What can be held beside traits: the colour of all reflected light and of the body, how light
-that is, and the look of the body below the highlight."""
 
 Method = Literal["flow", "linear"]
 
 RELATED = 0.5
-"""Rank correlation in the library from which two traits are related: they move together."""
+"""Rank correlation in the library from which two traits are related, and move together."""
 
 PLAUSIBLE = 0.002
-"""The share of the library that is less plausible than any point that a move may reach."""
+"""The share of the library that is less plausible than any point of a photoreal move."""
 
-_EXTREMES = (1.0, 99.0)  # percentiles of the library that no photoreal move goes beyond
-_BETWEEN = 0.05  # what differences between families count in the metric of moves
-_RIDGE = 1e-3  # of the mean variance: keeps the metric regular where the library is flat
-_NEAR = 2.5e-3  # of a score: what is as near as that is reached
-_FAR = 20.0  # units: no move is longer
+_EXTREMES = (1.0, 99.0)  # percentiles of the library's scores that no photoreal move passes
+_BETWEEN = 0.05  # weight of differences between families in the metric of moves; within them 1
+_RIDGE = 1e-3  # of the mean variance, added to the covariance so that it can be inverted
+_NEAR = 2.5e-3  # error of a score within which it counts as reached
+_FAR = 20.0  # scores: no move is longer
 _PERCENT = np.linspace(0.0, 1.0, 101)
-_KNOWN = 32  # moves whose way is kept, to go on from
+_KNOWN = 32  # moves whose curve is kept, so that a drag goes on from there
+_PARTS = ("names", "weights", "normals", "typical", "meanings", "synonyms")  # of definitions
 
-# what it costs, beside the metric of moves, that what is held changes
-_HUE = 3.0  # a degree
-_CHROMA = 0.3  # a unit of a* or b*
-_LIGHTNESS = 0.2  # a unit of L*
-_LOBE = 300.0  # log RGB of the lobe
-_HOLE = 0.12  # log f by which the middle of a highlight may be darker than what is around it
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """What makes two materials differ, in numbers, words and a picture.
-
-    Attributes
-    ----------
-    traits : by trait, its score before and after
-    descriptors : by descriptor (of `DESCRIPTORS`), its value before and after
-    plausibility : before and after
-    tables : the materials themselves
-    """
-
-    traits: Mapping[str, tuple[float, float]]
-    descriptors: Mapping[str, tuple[float, float]]
-    plausibility: tuple[float, float]
-    tables: tuple[TabulatedBRDF, TabulatedBRDF]
-
-    def __str__(self) -> str:
-        change = {name: after - before for name, (before, after) in self.traits.items()}
-        most = sorted(change, key=lambda name: -abs(change[name]))
-        said = [f"{name} {change[name]:+.2f}" for name in most if abs(change[name]) >= 0.05]
-        lines = ["traits: " + (", ".join(said[:8]) or "none changed by 0.05")]
-        d = self.descriptors
-        degrees = [math.degrees(math.exp(value)) for value in d["width"]]
-        for what, (before, after), unit in (
-            ("gloss at 60 degrees", d["gloss_60"], " GU"),
-            ("half width of the lobe", (degrees[0], degrees[1]), " degrees"),
-            ("specular albedo", d["specular"], ""),
-            ("diffuse albedo", d["diffuse"], ""),
-        ):
-            lines.append(f"{what}: {before:.3g} to {after:.3g}{unit}")
-        for kind in ("diffuse", "specular"):
-            hues, chroma = d[f"{kind}_hue"], d[f"{kind}_chroma"]
-            if max(chroma) >= PALE:
-                lines.append(
-                    f"{kind} hue: {hues[0]:.0f} to {hues[1]:.0f} degrees, "
-                    f"chroma {chroma[0]:.0f} to {chroma[1]:.0f}"
-                )
-        before, after = self.plausibility
-        lines.append(f"plausibility: {before:.2f} to {after:.2f}")
-        return "\n".join(lines)
-
-    def picture(
-        self, environment: EnvironmentMap | None = None, size: int = 192
-    ) -> NDArray[np.uint8]:
-        """Spheres of both side by side (H, W, 3), sRGB bytes; None is the procedural sky."""
-        # torch comes with it
-        from traitbrdf.pictures import sheet
-
-        return sheet({"": self.tables}, ("before", "after"), environment, size)
-
-    def _repr_png_(self) -> bytes:
-        file = io.BytesIO()
-        Image.fromarray(self.picture()).save(file, "png")
-        return file.getvalue()
-
-
-@dataclass(frozen=True)
-class Definition:
-    """What makes a trait: what its score adds up.
-
-    Attributes
-    ----------
-    name, meaning : str
-    weights : (d,) of the space's graded descriptors
-    normal : (k,), the straight part
-    typical : (2,) raw scores of the library's 10th and 90th percentile
-    """
-
-    name: str
-    weights: Float64
-    normal: Float64
-    typical: Float64
-    meaning: str = ""
+_HOLE = 0.12  # log f by which the middle of a highlight may be darker than its brightest ring
 
 
 class TraitSpace:
@@ -171,63 +79,65 @@ class TraitSpace:
 
     Parameters
     ----------
-    names : t trait names
-    normals : (t, k) array
-        Gradient of each raw score, or of its straight part.
-    typical : (t, 2) array
-        Raw scores of the library's 10th and 90th percentile.
-    covariance : (k, k) array
-        How coordinates vary together: the metric in which moves are short.
-    low, high : (k,) arrays, the gamut box
-    body : (rows, k) array or None
-        Linear functions of the coordinates that say how the body below the highlight looks; what
-        "body" stands for where it is held, and what `KEEPS_BODY` traits keep while they can.
+    traits : t Definition
+        Of graded descriptors (d,) and coordinates (k,).
+    box : Box
+        The gamut box (k,): no move leaves it.
+    statistics : Statistics
+        How coordinates and scores vary in the library.
+    optics : Optics, optional
+        How graded descriptors are computed from coordinates; left out if all traits are straight.
+    body : (rows, k) array_like, optional
+        Linear functions of the coordinates that describe the body below the highlight: what
+        holding "body" keeps.
+
+    Attributes
+    ----------
+    traits : tuple of Definition
+    names : tuple of str
+    normals, typical, weights : (t, k), (t, 2) and (t, d) float64
+        The parts of `traits`, stacked.
+    box : Box
+    low, high : (k,) float64
+        The ends of `box`.
+    covariance, related, limits, density
+        The parts of `statistics`.
     optics : Optics or None
-        How grades of descriptors are had of coordinates.
-    weights : (t, d) array or None, what a trait's score adds of the graded descriptors
-    related : (t, t) array or None
-        Rank correlations of the scores in the library; None takes all for related.
-    density : Density or None, where the library is; None lets moves go as far as the box
-    about : for each trait its meaning, and everyday names for it
-    limits : (t, 2) array or None
-        Scores that hardly any material of the library is below or above, beyond which no move
-        leads that shall be photoreal.
+    body : (rows, k) float64
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, a name or synonym given twice, or a 10th percentile that is not below the
+        90th.
     """
 
     def __init__(
         self,
-        names: Sequence[str],
-        normals: ArrayLike,
-        typical: ArrayLike,
-        covariance: ArrayLike,
-        low: ArrayLike,
-        high: ArrayLike,
-        body: ArrayLike | None = None,
+        traits: Sequence[Definition],
+        box: Box,
+        statistics: Statistics,
         optics: Optics | None = None,
-        weights: ArrayLike | None = None,
-        related: ArrayLike | None = None,
-        density: Density | None = None,
-        about: Mapping[str, tuple[str, tuple[str, ...]]] | None = None,
-        limits: ArrayLike | None = None,
+        body: ArrayLike | None = None,
     ) -> None:
-        self.names = tuple(names)
-        self.normals = np.asarray(normals, np.float64)
-        self.typical = np.asarray(typical, np.float64)
-        self.covariance = np.asarray(covariance, np.float64)
-        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        t, k = len(self.names), len(self.low)
+        self.traits = tuple(traits)
+        self.names = tuple(trait.name for trait in self.traits)
+        self.box = Box(*(np.asarray(end, np.float64) for end in box))
+        self.low, self.high = self.box
         self.optics = optics
+        t, k = len(self.names), len(self.low)
         d = len(optics.grades.names) if optics else 0
-        self.weights = np.zeros((t, d)) if weights is None else np.asarray(weights, np.float64)
-        self.related = np.ones((t, t)) if related is None else np.asarray(related, np.float64)
-        self.density = density
-        self.about = dict(about or {})
+        self.normals = stacked(self.traits, "normal", k)
+        self.typical = stacked(self.traits, "typical", 2)
+        self.weights = stacked(self.traits, "weights", d)
+        known = statistics
         unlimited = np.tile([-math.inf, math.inf], (t, 1))
-        self.limits = unlimited if limits is None else np.asarray(limits, np.float64)
-        expected = {
-            "normals": (t, k), "typical": (t, 2), "covariance": (k, k), "high": (k,),
-            "weights": (t, d), "related": (t, t), "limits": (t, 2),
-        }  # fmt: skip
+        self.covariance = np.asarray(known.covariance, np.float64)
+        self.related = np.asarray(np.ones((t, t)) if known.related is None else known.related,
+                                  np.float64)  # fmt: skip
+        self.limits = np.asarray(unlimited if known.limits is None else known.limits, np.float64)
+        self.density = known.density
+        expected = {"covariance": (k, k), "high": (k,), "related": (t, t), "limits": (t, 2)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 got = getattr(self, name).shape
@@ -238,59 +148,65 @@ class TraitSpace:
         self.body = np.zeros((0, k)) if body is None else np.asarray(body, np.float64)
         if self.body.ndim != 2 or self.body.shape[1] != k or not np.isfinite(self.body).all():
             raise ValueError(f"body: expected shape (rows, {k}), got {self.body.shape}")
-        self._synonyms = {
-            other: name for name, (_, others) in self.about.items() for other in others
-        }
+        self._synonyms = {other: one.name for one in self.traits for other in one.synonyms}
         self._places = {name: i for i, name in enumerate(self.names)}
-        self._places |= {
-            other: self._places[name]
-            for other, name in self._synonyms.items()
-            if name in self._places
-        }
+        self._places |= {other: self._places[name] for other, name in self._synonyms.items()}
+        every = [*self.names, *(other for one in self.traits for other in one.synonyms)]
+        if len(self._places) < len(every):
+            twice = sorted({name for name in every if every.count(name) > 1})
+            raise ValueError(f"traits: expected each name once, got {twice} more than once")
         self._flows: OrderedDict[Any, tuple[Flow, float]] = OrderedDict()
         self._lock = threading.Lock()
         metric = self.covariance + _RIDGE * np.trace(self.covariance) / k * np.eye(k)
-        self._ground = Ground.of(
-            optics, self.weights, self.normals, self.typical[:, 0], self._span,
-            np.linalg.inv(metric), self.low, self.high, density,
-        )  # fmt: skip
+        span = self._span[:, None]
+        scoring = Scoring(self.weights / span, self.normals / span, self.typical[:, 0] / self._span)
+        self._ground = Ground.of(scoring, np.linalg.inv(metric), self.box, optics, self.density)
 
     @classmethod
     def fit(
         cls,
         coordinates: ArrayLike,
-        labels: Mapping[str, ArrayLike],
-        low: ArrayLike,
-        high: ArrayLike,
+        traits: Sequence[Labelled],
+        box: Box,
         families: Sequence[str] | None = None,
-        body: ArrayLike | None = None,
         optics: Optics | None = None,
-        weights: ArrayLike | None = None,
-        about: Mapping[str, tuple[str, tuple[str, ...]]] | None = None,
+        body: ArrayLike | None = None,
     ) -> TraitSpace:
-        """Traits from labelled members, and from graded descriptors where there are weights.
+        """Fit traits to labelled members of a library.
+
+        A trait with weights of graded descriptors reads these. Any other is straight: the normal of
+        the plane that separates its labels (`traitbrdf.space.definitions.straight`).
 
         Parameters
         ----------
         coordinates : (n, k) array_like
-        labels : for each trait (n,) values: 1 has it, -1 has it not, 0 unclear
-        low, high : (k,) gamut box
-        families : (n,) names or None
-            Kinds of material. Moves then follow how members differ from others of their kind,
-            and only a little how kinds differ: a shinier plastic is a plastic still, and no metal.
-            They are also what `Density` is made of; None leaves it out.
-        body, optics, weights, about : as for `TraitSpace`
-            A trait whose weights are not all zero is read off descriptors, others are straight.
+            Coordinates of the members.
+        traits : t Labelled
+        box : Box
+            The gamut box (k,).
+        families : n str, optional
+            Kinds of material. With them, moves follow how members differ from others of their kind,
+            and only a little how kinds differ, so that a shinier plastic remains a plastic; and
+            `Density` is fitted, so that moves stay near the library.
+        optics, body
+            As for `TraitSpace`.
 
         Raises
         ------
         ValueError
-            If a trait's labels are of one class only, or of a wrong shape.
+            If a trait's labels are of one class only, or shapes do not match.
         """
         z = np.asarray(coordinates, np.float64)
-        normals = np.array([straight(z, given, name) for name, given in labels.items()])
-        if weights is not None:
-            normals[np.any(np.asarray(weights) != 0.0, axis=1)] = 0.0
+        unscaled = []
+        for name, labels, given, meaning, synonyms in traits:
+            d = len(optics.grades.names) if optics else 0
+            weights = np.zeros(d) if given is None else np.asarray(given, np.float64)
+            known = as_labels(labels, len(z), name)
+            read = bool(np.any(weights != 0.0))
+            normal = np.zeros(z.shape[1]) if read else straight(z, known, name)
+            unscaled.append(
+                Definition(name, weights, normal, np.array([0.0, 1.0]), meaning, synonyms)
+            )
         covariance, density = np.cov(z.T), None
         if families is not None:
             kinds = np.asarray(families)
@@ -301,76 +217,166 @@ class TraitSpace:
                 centred[kinds == kind] -= z[kinds == kind].mean(axis=0)
             covariance = np.cov(centred.T) + _BETWEEN * covariance
             density = Density.fit(z, list(families))
-        unscaled = np.tile([0.0, 1.0], (len(normals), 1))
-        space = cls(
-            list(labels), normals, unscaled, covariance, low, high, body, optics, weights,
-            None, density, about,
-        )  # fmt: skip
-        raw = space._raw(z)
+        statistics = Statistics(covariance, density=density)
+        raw = cls(unscaled, box, statistics, optics, body)._raw(z)
         typical = np.percentile(raw, [10.0, 90.0], axis=0).T
         limits = np.percentile(raw, _EXTREMES, axis=0).T - typical[:, :1]
         limits /= np.maximum(typical[:, 1:] - typical[:, :1], 1e-300)
-        return cls(
-            list(labels), normals, typical, covariance, low, high, body, optics, weights,
-            _rank_correlations(raw), density, about, limits,
-        )  # fmt: skip
+        scaled = [replace(one, typical=ends) for one, ends in zip(unscaled, typical, strict=True)]
+        statistics = replace(statistics, related=rank_correlations(raw), limits=limits)
+        return cls(scaled, box, statistics, optics, body)
 
     def __repr__(self) -> str:
         return f"TraitSpace({', '.join(self.names)})"
 
     def index(self, name: str) -> int:
-        """Where a trait stands in `names`, by its name or an everyday one.
+        """Return where a trait stands in `names`.
+
+        Parameters
+        ----------
+        name : str
+            The trait's name or an everyday one.
 
         Raises
         ------
         ValueError
-            On an unknown one, naming near ones.
+            If it is unknown; the message names the nearest ones.
         """
         if name not in self._places:
             raise ValueError(unknown_name("trait", name, (*self.names, *self._synonyms)))
         return self._places[name]
 
     def meaning(self, name: str) -> str:
-        """One line that says what a trait means."""
-        known = self.names[self.index(name)]
-        return self.about[known][0] if known in self.about else known
+        """Return one line that explains a trait.
+
+        Parameters
+        ----------
+        name : str
+            The trait's name or an everyday one.
+
+        Raises
+        ------
+        ValueError
+            If it is unknown.
+        """
+        trait = self.traits[self.index(name)]
+        return trait.meaning or trait.name
 
     # -- scores ---------------------------------------------------------------------------------
 
     def score(self, z: ArrayLike) -> dict[str, float]:
-        """Every trait's score at coordinates (k,): 0 is typically low, 1 typically high."""
+        """Return every trait's score at a point.
+
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        dict of float
+            By trait; 0 is typically low (the library's 10th percentile), 1 typically high (its
+            90th).
+
+        Raises
+        ------
+        ValueError
+            If `z` is not k finite numbers.
+        """
         return dict(zip(self.names, self.scores(self._point(z)).tolist(), strict=True))
 
     def scores(self, z: ArrayLike) -> Float64:
-        """Scores (..., t) at coordinates (..., k), in the order of `names`."""
+        """Return all scores at points.
+
+        Parameters
+        ----------
+        z : (..., k) array_like
+
+        Returns
+        -------
+        (..., t) float64, in the order of `names`
+        """
         return (self._raw(np.asarray(z, np.float64)) - self.typical[:, 0]) / self._span
 
     def grades(self, z: ArrayLike) -> Float64:
-        """Graded descriptors (..., d) at coordinates (..., k): how common in the library what is
-        read there is, in standard deviations; `optics.grades.names` are their names."""
+        """Return graded descriptors at points.
+
+        Parameters
+        ----------
+        z : (..., k) array_like
+
+        Returns
+        -------
+        (..., d) float64
+            How common each descriptor's value is in the library, in standard deviations;
+            `optics.grades.names` are the descriptors.
+
+        Raises
+        ------
+        ValueError
+            If this space reads no descriptors.
+        """
+        self._reads()
+        return self._ground.grades(np.asarray(z, np.float64))
+
+    def _reads(self) -> None:
+        """Raise ValueError if this space reads no descriptors."""
         if self.optics is None:
             raise ValueError(
                 "space: expected one that reads descriptors, got straight traits alone"
             )
-        return self._ground.grades(np.asarray(z, np.float64))
 
     def _raw(self, z: Float64) -> Float64:
+        """Return raw scores (..., t) at points (..., k)."""
         raw: Float64 = z @ self.normals.T
         if self.optics is not None:
             raw = raw + self.grades(z) @ self.weights.T
         return raw
 
-    def plausibility(self, z: ArrayLike) -> float:
-        """The share of the library that lies in less likely places than z (k,): 0 is unheard of.
+    def colours(self, z: ArrayLike) -> Float64:
+        """Return the colours that a person sees at a point, as CIELAB.
 
-        By a mixture of Gaussians over the families (`Density`). A point outside the box has 0.
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        (5, 3) array
+            L*, a* and b* of each of `traitbrdf.space.scores.SURFACES`.
+
+        Raises
+        ------
+        ValueError
+            If this space reads no descriptors, or `z` is not k finite numbers.
+        """
+        self._reads()
+        return self._ground.seen(self._point(z))
+
+    def plausibility(self, z: ArrayLike) -> float:
+        """Return the share of the library that lies in less likely places than a point.
+
+        Likelihood is that of a mixture of Gaussians over the families (`Density`).
+
+        Parameters
+        ----------
+        z : (k,) array_like
+
+        Returns
+        -------
+        float in [0, 1]
+            0 if the point is less likely than any member, or outside the gamut box.
+
+        Raises
+        ------
+        ValueError
+            If `z` is not k finite numbers.
         """
         point = self._point(z)
         outside = ((point < self.low - 1e-9) | (point > self.high + 1e-9)).any()
         return 0.0 if outside else self._common(point)
 
     def _common(self, z: Float64) -> float:
-        """`plausibility` of a point (k,) in the box."""
+        """Return the `plausibility` of a point (k,) in the box."""
         if self.density is None:
             return 1.0
         return float(np.interp(self.density.log(z), self.density.known, _PERCENT))
@@ -378,13 +384,20 @@ class TraitSpace:
     def explain(
         self, before: ArrayLike, after: ArrayLike, embedding: BRDFEmbedding | None = None
     ) -> Explanation:
-        """What changed from one point (k,) to another, in words, numbers and a picture.
+        """Explain how two points differ, in words, numbers and a picture.
 
-        Descriptors are read off the decoded tables.
+        Descriptors are measured on the decoded tables.
 
         Parameters
         ----------
-        embedding : whose coordinates they are; None is the default one
+        before, after : (k,) array_like
+        embedding : BRDFEmbedding, optional
+            Whose coordinates they are; the default one if left out.
+
+        Raises
+        ------
+        ValueError
+            If a point is not k finite numbers.
 
         Examples
         --------
@@ -410,8 +423,21 @@ class TraitSpace:
     # -- moves ----------------------------------------------------------------------------------
 
     def holds(self, amounts: Mapping[str, float]) -> tuple[str, ...]:
-        """What a move holds unless told otherwise: "colour", but where it moves a colour itself
-        (`COLOURS`), and "lightness", but where it is about that (`LIGHT`)."""
+        """Return what a move holds by default.
+
+        This is "colour", unless the move changes a colour itself (`COLOURS`), and "lightness",
+        unless it changes that (`LIGHT`).
+
+        Parameters
+        ----------
+        amounts : mapping of float
+            By trait, the change asked for.
+
+        Raises
+        ------
+        ValueError
+            On an unknown trait.
+        """
         moved = {self.names[self.index(name)] for name in amounts}
         colour = () if moved & COLOURS else ("colour",)
         return colour if moved & LIGHT else (*colour, "lightness")
@@ -424,25 +450,38 @@ class TraitSpace:
         photoreal: bool = True,
         method: Method = "flow",
     ) -> Float64:
-        """Coordinates (k,) whose scores differ from those of `z` by `amounts`.
+        """Return coordinates whose scores differ from those of `z` by `amounts`.
 
         Parameters
         ----------
         z : (k,) array_like
-        amounts : for each trait to move by how much; 1 is from typically low to typically high
-        hold : what shall stay; None is what `holds` says, () is nothing
-            Names of traits, whose scores stay; "colour", that of all reflected light and of the
-            body as a person sees it; "lightness" of all reflected light; "body", the look of what
-            lies below the highlight.
-        photoreal : whether to stay where materials of the library are near
-        method : "flow", or "linear", the straight vectors of Matusik et al. 2003
-            "linear" goes along one direction, the trait's slope at `z` in the metric of the
-            library, holds traits alone, and knows no walls but the box.
+        amounts : mapping of float
+            By trait, how much its score shall change; 1 leads from typically low to typically high.
+        hold : iterable of str, optional
+            What shall stay. Names of traits hold their scores; "colour" holds the colour of all
+            reflected light and of the body as a person sees it, "lightness" how light that is, and
+            "body" the look of what lies below the highlight. Left out, it is what `holds` returns;
+            () holds nothing.
+        photoreal : bool
+            Whether to stay where materials of the library are near.
+        method : "flow" or "linear"
+            "linear" moves along one straight vector as Matusik et al. 2003 do: the slope of the
+            scores at `z` in the library's Mahalanobis distance. It holds traits only, and stops at
+            the box only.
 
         Returns
         -------
-        (k,) array inside the gamut box. Where less than all is reached, it is the furthest point
-        (`reach` says how far that is, and why). Amounts of 0 return `z` as it is.
+        (k,) float64 inside the gamut box
+            If the move cannot be made in full, the furthest point (`reach` says how far it is, and
+            why). If all amounts are 0, `z` unchanged.
+
+        Raises
+        ------
+        ValueError
+            On an unknown trait, one named twice, an amount that is not finite, a trait both moved
+            and held, or held traits that forbid the move altogether.
+        TypeError
+            On an amount that is no number.
 
         Examples
         --------
@@ -452,12 +491,6 @@ class TraitSpace:
         >>> shinier = space.move(z, {"shiny": 0.5})
         >>> round(space.score(shinier)["shiny"] - space.score(z)["shiny"], 3)
         0.5
-
-        Raises
-        ------
-        ValueError
-            On an unknown trait, one named twice, an amount that is not finite, a trait both moved
-            and held, or held traits that forbid the move altogether.
         """
         return self.moved(z, amounts, hold, photoreal, method).z
 
@@ -469,7 +502,12 @@ class TraitSpace:
         photoreal: bool = True,
         method: Method = "flow",
     ) -> Moved:
-        """`move`, with the same errors, and all that is to be said of it."""
+        """Make a move, with the errors of `move`, and return all about its outcome.
+
+        Parameters
+        ----------
+        Other parameters as for `move`
+        """
         found = self.reach(z, amounts, hold, photoreal, method)
         if found.stopped.startswith("held"):
             raise ValueError(
@@ -487,10 +525,21 @@ class TraitSpace:
         photoreal: bool = True,
         method: Method = "flow",
     ) -> Moved:
-        """`move`, and how far it came.
+        """Make a move, and return how far it came.
 
-        Parameters, errors : as for `move`, but where held traits forbid the move, it stays where
-        it is and `Moved.stopped` says so.
+        Parameters
+        ----------
+        Other parameters as for `move`
+
+        Returns
+        -------
+        Moved
+            Where held traits forbid the move, `Moved.z` is the start and `Moved.stopped` says so.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `move`, but not for held traits that forbid the move.
         """
         start = self._point(z)
         moved, held, hold = self._checked(amounts, hold)
@@ -509,7 +558,8 @@ class TraitSpace:
             inside = np.minimum(np.maximum(start, self.low), self.high)
             flow, room = self._flow(inside, moved, held, hold, photoreal)
             found = flow.to(whole)
-            # a start outside of the box has another score than where its way begins
+            # a start outside the box has other scores than the point of the box where the move
+            # begins
             outside = (inside != start).any()
             change = found.score - (self._ground.look(start)[0] if outside else flow.score)
             move = self._said(found.z, change, moved, held, found.walled)
@@ -526,10 +576,22 @@ class TraitSpace:
         steps: int = 20,
         photoreal: bool = True,
     ) -> Float64:
-        """The whole curve (steps + 1, k) of a move, from `z` to where `move` ends, at equal shares
-        of the amounts.
+        """Return the whole curve of a move, from `z` to where `move` ends.
 
-        Other parameters, errors : as for `move`
+        Parameters
+        ----------
+        steps : int
+            Number of equal shares of the amounts, at least 1.
+        Other parameters as for `move`
+
+        Returns
+        -------
+        (steps + 1, k) float64
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `move`, and on a number of steps that is not positive.
 
         Examples
         --------
@@ -543,7 +605,7 @@ class TraitSpace:
         if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
             raise ValueError(f"steps: expected a positive integer, got {steps!r}")
         shares = np.linspace(0.0, 1.0, int(steps) + 1)
-        last = self.moved(z, amounts, hold, photoreal).z  # and all errors
+        last = self.moved(z, amounts, hold, photoreal).z  # first, since it raises all errors
         points = [
             self.reach(z, {name: s * float(value) for name, value in amounts.items()}, hold,
                        photoreal).z
@@ -554,7 +616,7 @@ class TraitSpace:
     def _checked(
         self, amounts: Mapping[str, float], hold: Iterable[str] | None
     ) -> tuple[dict[int, float], list[int], tuple[str, ...]]:
-        """The traits that move and by how much, those that are held, and all that is held."""
+        """Return moved traits and their amounts, held traits, and all that is held."""
         moved: dict[int, float] = {}
         for name, value in amounts.items():
             if (i := self.index(name)) in moved:
@@ -576,8 +638,10 @@ class TraitSpace:
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> tuple[Flow, float]:
-        """The flow of a move from a point of the box, as far as it is known, and how far its scores
-        may go."""
+        """Return the flow of a move from a point of the box, and how far its scores may go.
+
+        A flow that was used lately is reused.
+        """
         whole = max(abs(value) for value in moved.values())
         rates = {i: value / whole for i, value in moved.items()}
         key = (inside.tobytes(), tuple(rates.items()), tuple(held), hold, photoreal)
@@ -593,7 +657,7 @@ class TraitSpace:
         return self._flows[key]
 
     def _room(self, score: Float64, rates: Mapping[int, float]) -> float:
-        """How far a move may go until a score (t,) leaves what the library has."""
+        """Return how far a move may go until a score (t,) passes the library's limits."""
         room = _FAR
         for i, rate in rates.items():
             if abs(rate) > 1e-9:
@@ -609,7 +673,7 @@ class TraitSpace:
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> Task:
-        """The move from a point of the box."""
+        """Describe a move from a point of the box."""
         known = np.abs(self.related[list(rates)])
         apart = np.setdiff1d(np.flatnonzero((known < RELATED).all(axis=0)), [*rates, *held])
         limits = np.full(3, math.inf)
@@ -619,32 +683,14 @@ class TraitSpace:
             if self.density is not None:
                 rare = float(np.interp(PLAUSIBLE, _PERCENT, self.density.known))
                 limits[2] = unlikely(rare)
-            # members at the rim may stay as unlikely as they are
+            # a start beyond a limit may stay as far beyond it
             limits = np.maximum(limits, around.walls)
-        names = {self.names[i] for i in rates}
-        colour = float(self.optics is not None and ("colour" in hold or "color" in hold))
-        bodily = float(self.optics is not None and "body" not in hold and bool(names & KEEPS_BODY))
-        light = float(self.optics is not None and "lightness" in hold)
-        paling = bool(names & PALING)
-        steered = [name for name in names if name in STEERED] if len(names) == 1 else []
-        # by surface: light at 10, 30 and 60 degrees, the body, and the body lit from the side
-        hue = colour * _HUE * np.array([1.0, 1.0, 1.0, 1.0, 0.3])
-        chroma = colour * (0.0 if paling else _CHROMA) * np.array([1.0, 1.0, 1.0, 0.1, 1.0])
-        chroma += bodily * _CHROMA * np.array([0.0, 0.0, 0.0, 0.3, 0.0])
-        lightness = light * _LIGHTNESS * np.array([1.0, 1.0, 1.0, 0.0, 0.3])
-        lightness += bodily * _LIGHTNESS * np.array([0.0, 0.0, 0.0, 3.0, 0.0])
         return Task(
             moved=np.array([*rates], np.int64),
             rates=np.array([*rates.values()]),
             held=np.array(held, np.int64),
             apart=apart.astype(np.int64),
-            hue=hue,
-            chroma=chroma,
-            light=lightness,
-            steered=bool(steered),
-            steer=np.array(STEERED[steered[0]] if steered else (0.0, 0.0, 0.0)),
-            lobe=colour * _LOBE,
-            together=_LIGHTNESS * float("bright" in names),
+            costs=held_costs([self.names[i] for i in rates], hold if self.optics else None),
             body=self.body if "body" in hold else self.body[:0],
             limits=limits,
         )
@@ -658,7 +704,7 @@ class TraitSpace:
         hold: tuple[str, ...],
         photoreal: bool,
     ) -> str:
-        """Why a move did not reach all that was asked for."""
+        """Say why a move did not reach all that was asked for."""
         way = max(abs(value) for value in move.reached.values())
         many = len(move.asked) > 1 or any(name not in GROUPS for name in hold)
         if many and way < 1e-2 * min(whole, 1.0) and flow.why(0.0) & STEEP:
@@ -673,7 +719,10 @@ class TraitSpace:
         return "more would be a leap: the trait hardly depends on anything here"
 
     def _straight(self, start: Float64, moved: Mapping[int, float], held: list[int]) -> Float64:
-        """The end (k,) of a straight move: along slopes at the start, in the metric of moves."""
+        """Return the end (k,) of a straight move.
+
+        It follows the slopes of the scores at the start, in the metric of moves.
+        """
         inside = np.clip(start, self.low, self.high)
         slopes = self._ground.slopes(inside)[[*moved, *held]]
         along = np.linalg.solve(self._ground.stiffness, slopes.T)
@@ -689,7 +738,7 @@ class TraitSpace:
         held: list[int],
         walled: bool = False,
     ) -> Moved:
-        """What came of a move to z (k,), by which all scores (t,) change."""
+        """Describe a move to z (k,) that changes all scores by `change` (t,)."""
         made = change.tolist()
         return Moved(
             z,
@@ -701,7 +750,16 @@ class TraitSpace:
         )
 
     def held(self, hold: str) -> tuple[str, ...]:
-        """The traits (by name) that cannot be moved while a name is held.
+        """Return the traits that cannot be moved while something is held.
+
+        Parameters
+        ----------
+        hold : str
+            A trait, or one of `GROUPS`.
+
+        Returns
+        -------
+        tuple of str
 
         Raises
         ------
@@ -723,36 +781,45 @@ class TraitSpace:
     # -- traits of one's own ---------------------------------------------------------------------
 
     def with_trait(self, trait: Definition, library: Library | None = None) -> TraitSpace:
-        """This space and one trait more, or another one in the place of one of the same name.
+        """Return this space with one trait more; a trait of the same name is replaced.
+
+        Moves of other traits stay as they are, to the bit.
 
         Parameters
         ----------
-        trait : Definition, as `traitbrdf.Trait`
-        library : whose members say how traits are related; None is the default one
+        trait : Definition
+            A `traitbrdf.Trait`, for example.
+        library : Library, optional
+            Whose members say how traits are related, and how far they go; None is the default.
+
+        Raises
+        ------
+        ValueError
+            If the name is an everyday name of another trait, or shapes do not match.
         """
-        kept = [i for i, name in enumerate(self.names) if name != trait.name]
-        names = [*(self.names[i] for i in kept), trait.name]
         if trait.name in self._synonyms:
             raise ValueError(
                 f"name: {trait.name!r} is an everyday name of {self._synonyms[trait.name]!r}; "
                 "expected another"
             )
-        about = {**self.about, trait.name: (trait.meaning or trait.name, ())}
-        new = TraitSpace(
-            names, np.vstack([self.normals[kept], trait.normal]),
-            np.vstack([self.typical[kept], trait.typical]), self.covariance, self.low, self.high,
-            self.body, self.optics, np.vstack([self.weights[kept], trait.weights]),
-            None, self.density, about,
-        )  # fmt: skip
-        coordinates = (default_library() if library is None else library).coordinates
-        new.related = _rank_correlations(new._raw(coordinates))
-        new.limits = np.percentile(new.scores(coordinates), _EXTREMES, axis=0).T
-        return new
+        kept = [i for i, one in enumerate(self.traits) if one.name != trait.name]
+        trait = replace(trait, meaning=trait.meaning or trait.name)
+        traits = [*(self.traits[i] for i in kept), trait]
+        statistics = Statistics(self.covariance, density=self.density)
+        new = TraitSpace(traits, self.box, statistics, self.optics, self.body)
+        z = (library or default_library()).coordinates
+        related = with_one_more(self.related[np.ix_(kept, kept)], new._raw(z))
+        limits = np.vstack([self.limits[kept], np.percentile(new.scores(z)[:, -1], _EXTREMES)])
+        statistics = replace(statistics, related=related, limits=limits)
+        return TraitSpace(traits, self.box, statistics, self.optics, self.body)
 
     # -- files ----------------------------------------------------------------------------------
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The state as plain arrays; the box belongs to the embedding."""
+        """Return the state as plain arrays.
+
+        The gamut box is not among them, since it belongs to the embedding.
+        """
         state: dict[str, NDArray[Any]] = {
             "trait_names": np.array(self.names),
             "trait_normals": self.normals,
@@ -762,10 +829,8 @@ class TraitSpace:
             "trait_weights": self.weights,
             "trait_related": self.related,
             "trait_limits": self.limits,
-            "trait_meanings": np.array([self.about.get(n, ("",))[0] for n in self.names]),
-            "trait_synonyms": np.array(
-                ["|".join(self.about[n][1]) if n in self.about else "" for n in self.names]
-            ),
+            "trait_meanings": np.array([trait.meaning for trait in self.traits]),
+            "trait_synonyms": np.array(["|".join(trait.synonyms) for trait in self.traits]),
         }
         if self.optics is not None:
             state |= {f"reading_{k}": v for k, v in self.optics.readings._asdict().items()}
@@ -776,7 +841,13 @@ class TraitSpace:
 
     @classmethod
     def from_arrays(cls, state: Mapping[str, NDArray[Any]]) -> TraitSpace:
-        """The inverse of `arrays`, with the box `low`, `high` of the embedding's arrays."""
+        """Make a space from its arrays, the inverse of `arrays`.
+
+        Parameters
+        ----------
+        state : mapping of arrays
+            Those of `arrays`, and the box `low`, `high` of the embedding's arrays.
+        """
 
         def group(kind: str, names: Iterable[str]) -> list[Any]:
             some = [np.asarray(state[f"{kind}_{name}"]) for name in names]
@@ -791,60 +862,19 @@ class TraitSpace:
             )
         if "density_means" in state:
             density = Density(*group("density", Density._fields))
-        names = [str(n) for n in state["trait_names"]]
-        about = {
-            name: (str(meaning), tuple(str(others).split("|")) if str(others) else ())
-            for name, meaning, others in zip(
-                names, state["trait_meanings"], state["trait_synonyms"], strict=True
+        traits = [
+            Definition(
+                str(name), weights, normal, typical, str(meaning),
+                tuple(str(others).split("|")) if str(others) else (),
             )
-            if str(meaning)
-        }
-        return cls(
-            names, state["trait_normals"], state["trait_typical"], state["covariance"],
-            state["low"], state["high"], state["body"], optics, state["trait_weights"],
-            state["trait_related"], density, about, state["trait_limits"],
-        )  # fmt: skip
-
-
-def straight(z: Float64, labels: ArrayLike, name: str, means: bool = False) -> Float64:
-    """Trait vector (k,) between labelled members: the normal of a linear support vector machine,
-    or the difference of class means (both in Matusik et al. 2003, section 5).
-
-    Raises
-    ------
-    ValueError
-        If labels are of one class only, of a wrong shape, or others than -1, 0 and 1.
-    """
-    label = as_labels(labels, len(z), name)
-    if means:
-        return np.asarray(z[label == 1].mean(axis=0) - z[label == -1].mean(axis=0))
-    from sklearn.svm import LinearSVC  # slow to import, and needed only here
-
-    scale = np.maximum(z.std(axis=0), 1e-9)
-    clear = label != 0
-    machine = LinearSVC(C=0.1, dual=False).fit(z[clear] / scale, label[clear])
-    return np.asarray(machine.coef_[0] / scale, np.float64)
-
-
-def as_labels(labels: ArrayLike, count: int, name: str) -> NDArray[Any]:
-    """Labels (count,) of -1, 0 and 1, of both classes."""
-    label = np.asarray(labels)
-    if label.shape != (count,) or not np.isin(label, (-1, 0, 1)).all():
-        raise ValueError(
-            f"labels of {name!r}: expected ({count},) values of -1, 0 or 1, "
-            f"got shape {label.shape}: {label!r}"
+            for name, weights, normal, typical, meaning, others in zip(
+                *(state[f"trait_{part}"] for part in _PARTS), strict=True
+            )
+        ]  # fmt: skip
+        statistics = Statistics(
+            state["covariance"], state["trait_related"], state["trait_limits"], density
         )
-    if not ((label == 1).any() and (label == -1).any()):
-        raise ValueError(f"labels of {name!r}: expected materials with and without it")
-    return label
-
-
-def _rank_correlations(raw: Float64) -> Float64:
-    """Spearman's (t, t) of columns (n, t), ties shared."""
-    # statistics take a while to load, and are needed here alone
-    from scipy.stats import rankdata
-
-    return np.atleast_2d(np.corrcoef(rankdata(raw, axis=0).T))
+        return cls(traits, Box(state["low"], state["high"]), statistics, optics, state["body"])
 
 
 def _names(hold: Iterable[str]) -> tuple[str, ...]:
@@ -863,5 +893,8 @@ def _amount(name: str, value: float) -> float:
 
 @functools.lru_cache(maxsize=1)
 def default_traits() -> TraitSpace:
-    """The traits that the package ships, for `traitbrdf.default_embedding`."""
+    """Load the traits that the package ships, once.
+
+    They belong to `traitbrdf.default_embedding`.
+    """
     return TraitSpace.from_arrays(artifact())

@@ -172,15 +172,15 @@ class Server:
         self.token = secrets.token_urlsafe(24)
         # named in full, for asyncio lets sockets of TCP alone send small messages at once: else
         # every frame comes 40 ms late
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+        self.listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
         try:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._socket.bind(("127.0.0.1", port))
-            self._socket.listen(64)  # who comes before `run` waits
+            self.listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.listener.bind(("127.0.0.1", port))
+            self.listener.listen(64)  # who comes before `run` waits
         except OSError:
-            self._socket.close()
+            self.listener.close()
             raise
-        self.port = int(self._socket.getsockname()[1])
+        self.port = int(self.listener.getsockname()[1])
         self.url = f"http://127.0.0.1:{self.port}/?token={self.token}"
         self.socket_url = f"ws://127.0.0.1:{self.port}/socket?token={self.token}"
         self.origins = {f"http://{host}:{self.port}" for host in ("127.0.0.1", "localhost")}
@@ -199,9 +199,9 @@ class Server:
     def run(self) -> None:
         """Serve until `stop`, or an interruption from the keyboard."""
         try:
-            self._server.run(sockets=[self._socket])
+            self._server.run(sockets=[self.listener])
         finally:
-            self._socket.close()
+            self.listener.close()
 
     def stop(self) -> None:
         """End `run`, soon; from any thread."""

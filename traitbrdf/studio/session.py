@@ -112,21 +112,21 @@ class Session:
         self.folder = Path.cwd() if folder is None else Path(folder)
         self.quality = quality
         self._lock = threading.RLock()
-        self._pushes: dict[object, Push] = {}
+        self.subscribers: dict[object, Push] = {}
         self._sent: dict[str, NDArray[np.float32]] = {}
         self._stroke: Stroke | None = None
         self._strength = (0.0, 0.0, 0)  # pixels travelled, sum of pressures, samples
         self._sliding = False
         self._hand: str | None = None  # the view whose stroke or slider is at work
-        self._mine: object = None  # the edit that it replaces
+        self._mine: object = None  # the design that it made, and replaces
         self._only: str | None = None  # the part that the stroke at work stays on
         self._dragging = False
         self._part = edit.scene.parts[0]
         self._light: object = None
-        self._display = Display(1.0)
+        self.display = Display(1.0)
         self._telling: threading.Timer | None = None
         self._teller = ""  # the view that changed what will be told
-        self._refiner: threading.Thread | None = None
+        self.refiner: threading.Thread | None = None
         self._closed = False
         self._fraction = 0.0
         self._trouble = ""
@@ -154,11 +154,11 @@ class Session:
         """Have `push` called with what changes unasked, from any thread; returns how to end it."""
         key = object()
         with self._lock:
-            self._pushes[key] = push
+            self.subscribers[key] = push
 
         def end() -> None:
             with self._lock:
-                self._pushes.pop(key, None)
+                self.subscribers.pop(key, None)
 
         return end
 
@@ -166,12 +166,12 @@ class Session:
         """End what runs behind."""
         with self._lock:
             self._closed = True
-            self._pushes.clear()
+            self.subscribers.clear()
             if self._telling is not None:
                 self._telling.cancel()
         self.edit.cancel()
-        if self._refiner is not None:
-            self._refiner.join(10.0)
+        if self.refiner is not None:
+            self.refiner.join(10.0)
 
     def still(self) -> bytes:
         """The present frame as PNG: rendered, or drafted where that would take long."""
@@ -179,7 +179,7 @@ class Session:
             edit = self.edit
             image = edit.render(exact=False) if edit.ready else edit.draft()[0]
             self._expose(image)
-            return _png(self._display(image))
+            return _png(self.display(image))
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -338,13 +338,13 @@ class Session:
             inside = 0 <= x < scene.width and 0 <= y < scene.height
             under = int(scene.part_image[y, x]) if inside else -1
             self._only = scene.parts[under if under >= 0 else int(np.bincount(parts).argmax())]
-        self.edit.paint(stroke, self._only)
-        self._mine = self.edit.last
+        self.edit.paint(stroke, only=self._only)
+        self._mine = self.edit.design
         self._part = self._only or self._part
 
     def _take_back(self) -> None:
         """Undo what the stroke or slider at work did so far, unless something else came since."""
-        if self._mine is not None and self.edit.last is self._mine:
+        if self._mine is not None and self.edit.design is self._mine:
             self.edit.undo()
         self._mine = None
 
@@ -358,7 +358,7 @@ class Session:
         self._give_up()
         self.edit.move(part, **values)
         if slide.get("done") is not True:
-            self._mine, self._hand, self._sliding = self.edit.last, view, True
+            self._mine, self._hand, self._sliding = self.edit.design, view, True
 
     def _assign(self, assign: object) -> None:
         if not isinstance(assign, Mapping):
@@ -435,7 +435,7 @@ class Session:
         told: Header = {}
         if self._hand != view:  # a hand at work is told once it rests
             known = edit.history
-            told = {"edits": len(known), "history": [_shortened(line) for line in known[-6:]]}
+            told = {"edits": len(edit.layers), "history": [_shortened(line) for line in known[-6:]]}
         return {
             "part": self._part,
             "material": edit.material(self._part).name or "",
@@ -455,7 +455,7 @@ class Session:
         """Choose the exposure by an image: one while the light stays, so that edits are seen."""
         light = self.edit.scene.environment.image
         if self._light is not light:
-            self._light, self._display = light, Display(exposure_of(image))
+            self._light, self.display = light, Display(exposure_of(image))
             self._sent.clear()
 
     def _encoded(
@@ -474,7 +474,7 @@ class Session:
         size = {"x": x0, "y": y0, "w": x1 - x0, "h": y1 - y0, "width": width, "height": height}
         if y0 >= y1:
             return {"format": "none", **size}, b""
-        pixels = self._display(np.ascontiguousarray(image[y0:y1, x0:x1]))
+        pixels = self.display(np.ascontiguousarray(image[y0:y1, x0:x1]))
         if lossless:
             return {"format": "png", **size}, _png(pixels)
         if pixels.nbytes <= _RAW:
@@ -503,7 +503,7 @@ class Session:
                 "kind": "changed", "by": self._teller, "ready": self.edit.ready,
                 "fraction": round(self._fraction, 3),
             }  # fmt: skip
-            pushes = list(self._pushes.values())
+            pushes = list(self.subscribers.values())
         for push in pushes:
             try:
                 push(dict(news), [])
@@ -512,12 +512,12 @@ class Session:
 
     def _refine(self) -> None:
         """Have the view prepared behind, and tell when it has come on."""
-        if self._closed or (self._refiner is not None and self._refiner.is_alive()):
+        if self._closed or (self.refiner is not None and self.refiner.is_alive()):
             return
         self._trouble = ""
         self._fraction = 0.0
-        self._refiner = threading.Thread(target=self._prepare, name="traitbrdf-studio", daemon=True)
-        self._refiner.start()
+        self.refiner = threading.Thread(target=self._prepare, name="traitbrdf-studio", daemon=True)
+        self.refiner.start()
 
     def _prepare(self) -> None:
         """Until what is shown is prepared, or cannot be."""
@@ -540,7 +540,7 @@ class Session:
                 return
             with self._lock:
                 if self.edit is edit and (edit.ready or self._closed):
-                    self._refiner = None
+                    self.refiner = None
                     return
 
 

@@ -32,7 +32,7 @@ class Canvas(anywidget.AnyWidget):
     def __init__(self, edit: EditSession, **settings: Any) -> None:
         super().__init__(**settings)
         self.session = Session(edit)
-        self._server: Server | None = None
+        self.server: Server | None = None
         self.on_msg(self._answer)
         self.session.subscribe(lambda header, buffers: self.send(header, buffers))
 
@@ -49,14 +49,14 @@ class Canvas(anywidget.AnyWidget):
             return None
         if urlsplit(origin).hostname not in ("127.0.0.1", "localhost"):
             return None
-        if self._server is None:
+        if self.server is None:
             try:
-                self._server = Server(self.session)
+                self.server = Server(self.session)
             except OSError:  # a machine without sockets
                 return None
-            threading.Thread(target=self._server.run, name="traitbrdf-page", daemon=True).start()
-        self._server.origins.add(origin)
-        return self._server.socket_url
+            threading.Thread(target=self.server.run, name="traitbrdf-page", daemon=True).start()
+        self.server.origins.add(origin)
+        return self.server.socket_url
 
     def _repr_mimebundle_(self, **settings: Any) -> Any:
         """The widget, and a still picture for pages that have no kernel."""
@@ -69,7 +69,7 @@ class Canvas(anywidget.AnyWidget):
         return {**still, **bundle}
 
     def close(self) -> None:
-        if self._server is not None:
-            self._server.stop()
+        if self.server is not None:
+            self.server.stop()
         self.session.close()
         super().close()

@@ -1,0 +1,112 @@
+"""Layers: an effect, a mask and an opacity each."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+from traitbrdf.design.effects import Effect, Move, Named, table_name
+from traitbrdf.design.masks import Framing, Painted, Parts
+
+_KEYS = itertools.count()
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One layer of a design.
+
+    Attributes
+    ----------
+    effect : Effect, what changes
+    mask : Parts, where and how much
+    opacity : in [0, 1], scales the effect
+    visible : whether the layer counts at all
+    name : for people; may be empty
+    key : int
+        Tells this layer from all others of the process, however its settings change; it is not
+        part of the value.
+    """
+
+    effect: Effect
+    mask: Parts
+    opacity: float = 1.0
+    visible: bool = True
+    name: str = ""
+    key: int = field(default_factory=lambda: next(_KEYS), compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.effect, Effect):
+            raise TypeError(f"effect: expected an effect such as tb.Move, got {self.effect!r}")
+        if not isinstance(self.mask, Parts):
+            raise TypeError(f"mask: expected a mask, got {self.mask!r}")
+        if isinstance(self.opacity, bool) or not isinstance(self.opacity, (int, float)):
+            raise TypeError(f"opacity: expected a number, got {self.opacity!r}")
+        if not (math.isfinite(self.opacity) and 0.0 <= self.opacity <= 1.0):
+            raise ValueError(f"opacity: expected 0 to 1, got {self.opacity!r}")
+        if not isinstance(self.visible, bool):
+            raise TypeError(f"visible: expected True or False, got {self.visible!r}")
+        if not isinstance(self.name, str):
+            raise TypeError(f"name: expected a string, got {self.name!r}")
+        object.__setattr__(self, "opacity", float(self.opacity))
+
+    def weight(self, part: str) -> float:
+        """Return how much of the effect a part gets: 0 where the layer does not count."""
+        if not self.visible:
+            return 0.0
+        return self.opacity * dict(self.mask.weights).get(part, 0.0)
+
+    @property
+    def anywhere(self) -> set[str]:
+        """The parts that the layer may lead anywhere in the gamut."""
+        if not self.effect.anywhere and self.opacity == 1.0:
+            return set()
+        return {part for part, _ in self.mask.weights}
+
+    def calls(self, framing: Framing, named: Named = table_name) -> list[str]:
+        """Return the Python statements that add the layer to an `EditSession`.
+
+        Parameters
+        ----------
+        framing : Framing
+            A stroke that was painted under another one is told as the parts that it touched.
+        named : as for `Effect.call`
+        """
+        settings = [
+            f"edit.layers[-1].{name} = {value!r}"
+            for name, value, usual in (
+                ("name", self.name, ""),
+                ("opacity", self.opacity, 1.0),
+                ("visible", self.visible, True),
+            )
+            if value != usual
+        ]
+        return [self._added(framing, named), *settings]
+
+    def _added(self, framing: Framing, named: Named) -> str:
+        mask, effect = self.mask, self.effect
+        if not isinstance(mask, Painted) or mask.framing != framing:
+            return effect.call(mask.source(), named)
+        said = [repr([*mask.stroke.points])]
+        if isinstance(effect, Move) and len(effect.amounts) == 1 and effect.photoreal:
+            ((trait, amount),) = effect.amounts
+            said += [f"trait={trait!r}", f"amount={amount!r}"]
+            hold = "" if effect.hold is None else f", hold={effect.hold!r}"
+            beside = ""
+        else:
+            hold, beside = "", f", {effect.source(named)}"
+        said.append(f"radius={float(mask.stroke.radius)!r}{hold}")
+        if mask.only is not None:
+            only = mask.only[0] if len(mask.only) == 1 else mask.only
+            beside += f", only={only!r}"
+        return f"edit.paint(tb.Stroke({', '.join(said)}){beside})"
+
+    def __str__(self) -> str:
+        hidden = "" if self.visible else ", hidden"
+        faint = "" if self.opacity == 1.0 else f", opacity {self.opacity:g}"
+        name = f"{self.name!r}: " if self.name else ""
+        where = ", ".join(
+            part if weight == 1.0 else f"{part} ({weight:.0%})"
+            for part, weight in self.mask.weights
+        )
+        return f"{name}{self.effect!r} on {where}{faint}{hidden}"

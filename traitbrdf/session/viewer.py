@@ -1,0 +1,524 @@
+"""A scene shown live: prepared once, then drawn from whatever materials its parts have.
+
+*Views.* Camera, light and size are not part of the materials: `Viewer.look` changes them. All that
+is prepared for one view lies in one object (`View`), which the next look replaces as a whole, so
+that no frame of an old view can turn up later.
+
+*Threads.* A preparation may run behind (`prepare(wait=False)`). It works on what it was given,
+publishes its result in one step under the viewer's lock, and stops at its next sign of progress
+when it is cancelled. Heavy work takes turns (`TURNS`): drafts and exact frames, which somebody
+waits for, go first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+import time
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from typing import Any, Literal, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from traitbrdf.formats.files import unknown_name
+from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.lights import EnvironmentMap, Light
+from traitbrdf.scene.scene import Scene
+from traitbrdf.session.cache import Cache
+from traitbrdf.session.frames import Drafted, View, enlarged, measured
+from traitbrdf.session.preparation import (
+    DRAFT_SIZE,
+    TURNS,
+    LightTrees,
+    Preparation,
+    Prepared,
+    prepare_view,
+)
+from traitbrdf.session.rendering import Renderer
+from traitbrdf.session.settings import Settings
+from traitbrdf.space.embedding import BRDFEmbedding
+from traitbrdf.space.library import Library
+from traitbrdf.space.material import Material
+from traitbrdf.space.traits import TraitSpace
+from traitbrdf.transport.angles import AnglesSeen, angles_seen
+from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.transport import Transport
+from traitbrdf.transport.visibility import Progress
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+_TICK = 0.2  # seconds between two looks at how far a preparation has come
+
+
+class Viewer:
+    """Frames of a scene whose parts have materials; `EditSession` is one whose materials change.
+
+    Subclasses say what the parts are made of (`materials`), what materials are made with
+    (`library`, `traits`), and which parts may come to be made of anything (`_edited`).
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : Settings, what is asked for
+    progress : called with (stage, fraction) while the scene is prepared; may raise to cancel
+    transport : Transport of this very scene, already prepared; None prepares it when needed
+
+    Raises
+    ------
+    TypeError, ValueError
+        On something that is no scene, or the transport of another one.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings,
+        progress: Progress | None = None,
+        transport: Transport | None = None,
+    ) -> None:
+        if not isinstance(scene, Scene):
+            raise TypeError(f"scene: expected a Scene, got {scene!r}")
+        self.settings = settings
+        self.progress = progress
+        self._cache = Cache.usual() if settings.cache else None
+        self._trees = LightTrees()
+        self._lock = threading.RLock()
+        self._view = View(scene)
+        self._edited: set[str] = set()  # parts that a preparation has to serve all edits of
+        if transport is not None:
+            if transport.scene is not scene:
+                raise ValueError("transport: expected the transport of this scene, got another's")
+            self._view.prepared = Prepared(transport, False, {}, transport)
+
+    @property
+    def materials(self) -> Mapping[str, Material]:
+        """The material of every part."""
+        raise NotImplementedError
+
+    @property
+    def library(self) -> Library:
+        """What materials are named in and decoded by."""
+        raise NotImplementedError
+
+    @property
+    def traits(self) -> TraitSpace:
+        """What materials are moved by."""
+        raise NotImplementedError
+
+    @property
+    def embedding(self) -> BRDFEmbedding:
+        """The library's embedding."""
+        return self.library.embedding
+
+    @property
+    def view(self) -> View:
+        """All that is prepared and shown of the present scene; the next `look` replaces it."""
+        return self._view
+
+    @property
+    def quality(self) -> str:
+        """Of `settings`."""
+        return self.settings.quality
+
+    @property
+    def error(self) -> float | None:
+        """Of `settings`."""
+        return self.settings.error
+
+    @property
+    def fps(self) -> float | None:
+        """Of `settings`."""
+        return self.settings.fps
+
+    @property
+    def device(self) -> torch.device:
+        """Of `settings`."""
+        return self.settings.place
+
+    @property
+    def seed(self) -> int:
+        """Of `settings`."""
+        return self.settings.seed
+
+    @property
+    def scene(self) -> Scene:
+        """What is looked at; `look` replaces it."""
+        return self._view.scene
+
+    def part(self, name: str) -> int:
+        """Index of a part; an unknown name raises ValueError naming the near ones."""
+        if name not in self.scene.parts:
+            raise ValueError(unknown_name("part", name, self.scene.parts))
+        return self.scene.parts.index(name)
+
+    # -- view and light -------------------------------------------------------------------------
+
+    def look(
+        self,
+        camera: Camera | None = None,
+        environment: EnvironmentMap | None = None,
+        lights: Sequence[Light] | None = None,
+        size: int | tuple[int, int] | None = None,
+        rotation: float | None = None,
+    ) -> None:
+        """Change the view or the light; what is None stays. Materials and undo stay as well.
+
+        A preparation that runs is cancelled; the next `render` prepares the new view.
+
+        Parameters
+        ----------
+        camera : Camera
+        environment : EnvironmentMap
+        lights : the point and directional lights, all of them
+        size : int or (height, width)
+        rotation : radians
+            Angle by which the map is turned about +y (`EnvironmentMap.rotation`).
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `Scene` does. Nothing is changed then.
+        """
+        with self._lock:
+            scene = self.scene
+            light = scene.environment if environment is None else environment
+            if not isinstance(light, EnvironmentMap):
+                raise TypeError(f"environment: expected an EnvironmentMap, got {light!r}")
+            if rotation is not None:
+                clipped = light.clipped_texels
+                light = EnvironmentMap(light.image, rotation)
+                light.clipped_texels = clipped
+            wanted: dict[str, Any] = {}
+            if light.image is not scene.environment.image or (
+                light.rotation != scene.environment.rotation
+            ):
+                wanted["environment"] = light
+            if camera is not None and camera != scene.camera:
+                wanted["camera"] = camera
+            if lights is not None and tuple(lights) != scene.lights:
+                wanted["lights"] = lights
+            if size is not None:
+                pair = tuple(size) if isinstance(size, (tuple, list)) else (size, size)
+                if pair != (scene.height, scene.width):
+                    wanted["size"] = size
+            if not wanted:
+                return
+            old, self._view = self._view, View(scene.changed(**wanted))
+            if old.job is not None:
+                old.job.stop()
+
+    # -- frames ---------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether the present view is prepared: `render` then takes milliseconds."""
+        return self._serving(self._view) is not None
+
+    def _serving(self, view: View) -> Transport | None:
+        """The view's transport, if it is prepared and can show the present materials."""
+        known = view.prepared
+        if known is None:
+            return None
+        for index, material in known.fixed.items():
+            part = view.scene.parts[index]
+            if part in self._edited or self.materials[part] != material:
+                return None
+        return known.transport
+
+    @overload
+    def prepare(self, wait: Literal[True] = True) -> Transport: ...
+
+    @overload
+    def prepare(self, wait: bool) -> Transport | None: ...
+
+    def prepare(self, wait: bool = True) -> Transport | None:
+        """Compress the scene's light transport, unless that is done already.
+
+        A ground that nobody edits is prepared for its material alone; the first edit of it has
+        the rest done.
+
+        Parameters
+        ----------
+        wait : bool
+            False starts the preparation in a thread behind, unless one runs, and returns at once.
+
+        Returns
+        -------
+        The prepared transport; None while it is not ready (only if `wait` is False).
+
+        Raises
+        ------
+        concurrent.futures.CancelledError
+            If it was cancelled by another thread while this one waited.
+        RuntimeError
+            If the `progress` callback waits for the preparation that called it.
+        Exception
+            What a preparation that ran behind failed with, once; the next call tries again.
+        """
+        while True:
+            with self._lock:
+                view, job = self._view, self._view.job
+                transport = self._serving(view)
+                if transport is not None:
+                    return transport
+                fresh = job is None
+                if job is None:
+                    job = view.job = self._new_job(view)
+                elif job.error is not None:
+                    view.job = None
+            if fresh and not wait:
+                job.start()
+            elif fresh:
+                job.run()
+            if job.error is not None:
+                with self._lock:
+                    if view.job is job:
+                        view.job = None
+                raise job.error
+            if not wait:
+                return None
+            if job.thread is threading.current_thread() and not job.done.is_set():
+                raise RuntimeError("prepare: expected another thread than that of the preparation")
+            job.done.wait()
+            if job.stopped and self._view is view and self._serving(view) is None:
+                raise CancelledError("the preparation was cancelled")
+
+    def _new_job(self, view: View) -> Preparation:
+        # neither of these holds the session: a session that nobody needs any more can go
+        lock = self._lock
+
+        def publish(job: Preparation, prepared: Prepared) -> None:
+            with lock:
+                known = view.prepared
+                if known is None or len(known.fixed) > len(prepared.fixed):
+                    view.prepared, view.canvas = prepared, None
+                    view.times["prepare"] = job.seconds
+                if view.job is job:
+                    view.job = None
+
+        scene, fixed = view.scene, {}
+        if scene.ground and scene.parts[-1] not in self._edited and view.prepared is None:
+            fixed[len(scene.parts) - 1] = self.materials[scene.parts[-1]]
+        known = None if view.prepared is None else view.prepared.whole
+        work = functools.partial(
+            prepare_view, scene, self.settings, self.library, self.traits, self._cache, fixed, known
+        )  # fmt: skip
+        return Preparation(work, publish, self.progress, weakref.ref(self))
+
+    def cancel(self) -> None:
+        """Stop a preparation that runs, soon; the session goes on as if it had not begun."""
+        with self._lock:
+            job = self._view.job
+            if job is not None and not job.done.is_set():
+                self._view.job = None
+                job.stop()
+
+    def draft(self, size: int | None = None) -> tuple[Float32, float]:
+        """A first image at once, without any preparation.
+
+        It is rendered at a small size and enlarged; the first one of a view takes longer than those
+        after it.
+
+        Parameters
+        ----------
+        size : int
+            Pixels along the longer side of what is rendered; None is 128.
+
+        Returns
+        -------
+        image : (H, W, 3) float32 linear radiance, backdrop included
+        error : float
+            Mean relative L1 over the small image's covered pixels, measured at some of them.
+        """
+        size = DRAFT_SIZE if size is None else size
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
+        while True:
+            with self._lock:
+                view = self._view
+                scene = view.scene
+                materials = tuple(self.materials[part] for part in scene.parts)
+            known = view.drafted
+            if known is None or known.size != size or known.materials != materials:
+                with TURNS.urgent():
+                    known = view.drafted = self._draft(view, materials, size)
+            if view is self._view:  # else it is a picture of what was looked at before
+                return enlarged(known.image, scene.height, scene.width), known.error
+
+    def _draft(self, view: View, materials: tuple[Material, ...], size: int) -> Drafted:
+        start = time.perf_counter()
+        if view.draft is None or view.draft[0] != size:
+            tree = self._trees.of(view.scene.environment)
+            grid = self.embedding.grid_
+            view.draft = size, Draft(view.scene, grid, size, tree=tree, seed=self.settings.seed)
+        tables = {m: m.values(self.embedding) for m in materials}
+        image, error = view.draft[1].render(
+            [tables[m] for m in materials], [m.mirror for m in materials]
+        )
+        view.times["draft"] = time.perf_counter() - start
+        return Drafted(size, materials, image, error)
+
+    def render(self, wait: bool = True, exact: bool = True) -> Float32:
+        """The frame (H, W, 3) float32: linear radiance, backdrop included, never negative.
+
+        Parts whose material is that of a recent frame are not computed again, and
+        only the pixels of those that changed are drawn. The array is the caller's.
+
+        Parameters
+        ----------
+        wait : bool
+            False returns the draft while the view is not prepared, and has it prepared behind.
+        exact : bool
+            False shows by the basis what it cannot promise as well, within milliseconds:
+            `doubtful` names those parts then, and `frame_error` has what was measured.
+
+        Raises
+        ------
+        As `prepare` does.
+        """
+        while not wait:
+            with self._lock:
+                view = self._view
+                transport = self._serving(view)
+                if transport is not None:
+                    return self._frame(view, transport, exact)
+            image, _ = self.draft()
+            if self.prepare(wait=False) is None:
+                return image
+        with self._prepared() as (view, transport):
+            return self._frame(view, transport, exact)
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Parts of the last frame whose measured error is more than the basis is trusted with."""
+        with self._lock:
+            view = self._view
+            return [
+                view.scene.parts[i]
+                for i, one in enumerate(view.shown)
+                if one.tier != "exact" and one.frame.error > self.renderer.allowed(view, i)
+            ]
+
+    @property
+    def frame_error(self) -> float | None:
+        """Mean relative L1 of the last frame by its own measurement; None before the first."""
+        with self._lock:
+            view = self._view
+            known = view.prepared
+            return measured(view, known.transport) if known is not None and view.shown else None
+
+    def frames(self) -> Iterator[tuple[Float32, float, float]]:
+        """Images that get better: the draft, then the finished frame.
+
+        Yields (image, error, fraction): the image and its error as `draft` has them, again
+        whenever the preparation has come on or a material has changed; at last the frame and its
+        measured error, with a fraction of 1. Closing the generator cancels the preparation, and
+        cancelling the preparation ends the generator.
+
+        Examples
+        --------
+        >>> for image, error, fraction in edit.frames():  # doctest: +SKIP
+        ...     show(image, f"{fraction:.0%}, error {error:.2%}")
+        """
+        view, job = self._view, None
+        try:
+            while not self.ready:
+                image, error = self.draft()
+                yield image, error, 0.0 if job is None else job.fraction
+                with self._lock:
+                    if self._view is not view:  # what was begun for the old view is void
+                        view, job = self._view, None
+                    if job is not None and job.stopped:
+                        return
+                    self.prepare(wait=False)
+                    job = view.job or job
+                if job is not None:
+                    job.done.wait(_TICK)
+            with self._prepared() as (view, transport):
+                image, error = self._frame(view, transport), measured(view, transport)
+            yield image, error, 1.0
+        finally:
+            if not self.ready:
+                self.cancel()
+
+    @contextlib.contextmanager
+    def _prepared(self) -> Iterator[tuple[View, Transport]]:
+        """The lock, held once the present view is ready: never while it is waited for."""
+        while True:
+            self.prepare()
+            with self._lock:
+                view = self._view
+                transport = self._serving(view)
+                if transport is not None:
+                    yield view, transport
+                    return
+
+    @property
+    def renderer(self) -> Renderer:
+        """What makes the frames of a view, as exact as was asked for."""
+        return Renderer(self.embedding, self.settings)
+
+    def _frame(self, view: View, transport: Transport, exact: bool = True) -> Float32:
+        materials = [self.materials[part] for part in view.scene.parts]
+        return self.renderer.frame(view, transport, materials, exact)
+
+    # -- gradients ------------------------------------------------------------------------------
+
+    def radiance(self, part: str, z: torch.Tensor) -> torch.Tensor:
+        """A part's linear radiance as a differentiable function of coordinates.
+
+        Parameters
+        ----------
+        part : name
+        z : (k,) tensor, float32 or float64
+
+        Returns
+        -------
+        (P, 3) float32 tensor on the session's device: what the part would add to its pixels (see
+        `gradient` for which) if its coordinates were `z`, by the basis and not clamped at 0. What
+        an assigned table has beyond the manifold, and a mirror beside it, stay.
+        """
+        index, material = self.part(part), self.materials[part]
+        self._edited.add(part)
+        with self._prepared() as (_, transport):
+            table = self.embedding.decode_tensor(z, material.offset, transport.cells)
+            shown = transport.radiance(index, table.to(self.device, torch.float32))
+            known = transport.parts[index]
+            if known is None or not material.mirror.any():
+                return shown
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.device)
+            return shown + mirror * known.mirror
+
+    def gradient(self, part: str) -> tuple[Int64, Float32]:
+        """Derivative of the linear frame by a part's coordinates, in closed form.
+
+        Returns
+        -------
+        pixels : (P,) int64
+            Flat indices (row * width + column) of the pixels that show the part.
+        slopes : (P, 3, k) float32
+            d radiance / d z of each pixel and colour: of what `radiance` gives at the part's
+            present coordinates.
+        """
+        index, material = self.part(part), self.materials[part]
+        self._edited.add(part)
+        with self._prepared() as (view, transport):
+            slopes = self.embedding.jacobian(material.z, material.offset, transport.cells)
+            columns = torch.from_numpy(slopes).to(self.device).permute(2, 0, 1)
+            # radiance is linear in the table: all coordinates in one product
+            moved = torch.vmap(lambda table: transport.radiance(index, table))(columns)
+            pixels = view.scene.pixels[view.scene.part_slice(index)].copy()
+        return pixels, moved.permute(1, 2, 0).contiguous().cpu().numpy()
+
+    def angles(self, part: str | None = None) -> AnglesSeen:
+        """Which angles of the BRDF of a part (None: of the shape) this scene shows at all.
+
+        What light and view leave out, no edit changes: `traitbrdf.pictures.angle_map` draws it.
+        """
+        index = None if part is None else self.part(part)
+        return angles_seen(self.scene, self.embedding.grid_, index)
