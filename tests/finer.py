@@ -1,7 +1,7 @@
-"""Another integrator than the oracle's, to hold its stated errors against.
+"""A second integrator, to check the stated errors of `traitbrdf.reference`.
 
-Gauss-Legendre of high order on a mesh of its own, and up to the exact horizon: no cell is sampled
-across it. Nothing of it is shared with `traitbrdf.reference` but the cells of constant light.
+It uses Gauss-Legendre rules of high order on a mesh of its own, which ends exactly at the horizon.
+It shares only the cells of constant light with `traitbrdf.reference`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from traitbrdf.directions import to_local
 
 STEPS = ((0.5, 5), (0.5, 8), (0.35, 6), (0.25, 8), (0.18, 6), (0.13, 8), (0.09, 6))
-"""(size, order) of ever finer runs; successive orders differ, for the cells may not."""
+"""(size, order) of ever finer runs; successive orders differ, as the cells may be the same."""
 _LIMIT = 150_000
 
 
 def settled(cells, n, v, models, allowed):
-    """The integral (B, 3) for models, each refined until it changes by `allowed` (B,) at most.
+    """Integrate for models (B, 3); refine each until it changes by `allowed` (B,) at most.
 
     NaN for those that do not settle. `n` and `v` are in the map's frame.
     """
@@ -39,7 +39,7 @@ def settled(cells, n, v, models, allowed):
 
 
 def integral(cells, n, v, models, size, order):
-    """The integral with cells `size` times their distance from what is sharp; None if too many."""
+    """Integrate with cells `size` times their distance from sharp features; None if too many."""
     wo = np.asarray(to_local(v, n))
     turn = math.atan2(-n[0], n[2])  # where the horizon is highest or lowest
     inside, across = _mesh(*_halves(cells, turn), n, v, wo[2], turn, size)
@@ -52,13 +52,13 @@ def integral(cells, n, v, models, size, order):
         step = 200_000 // order**2
         for i in range(0, edges.shape[1], step):
             top, bottom, left, right = (e[:, None] for e in edges[:, i : i + step])
-            if cut:  # a substitution that takes the square roots off both ends
+            if cut:  # a substitution that removes the square roots at both ends
                 a = 0.5 * math.pi * (x + 1.0)
                 t = 0.5 * (top + bottom) - 0.5 * (bottom - top) * np.cos(a)
                 gt = 0.25 * math.pi * g * np.sin(a) * (bottom - top)
                 ratio = -n[1] * np.cos(t) / np.maximum(slope * np.sin(t), 1e-300)
                 arc = np.arccos(np.clip(ratio, -1.0, 1.0))
-                # light is seen within `arc` of the azimuth `turn`: at the start of even half turns
+                # light is above the horizon within `arc` of `turn`: at the start of even half turns
                 half = np.floor((left + right) / (2.0 * math.pi))
                 even = np.mod(half, 2.0) == 0.0
                 end = np.clip(half * math.pi + np.where(even, arc, math.pi - arc), left, right)
@@ -83,7 +83,7 @@ def _direction(t, p):
 
 
 def _halves(cells, turn):
-    """Light and edges (4, k) of cells, cut at the two meridians `turn` and opposite to it."""
+    """Light and edges (4, k) of cells, cut at the meridian `turn` and at the opposite one."""
     left, right = cells.left - turn, cells.right - turn
     parts = []
     for k in range(-2, 3):
@@ -94,7 +94,7 @@ def _halves(cells, turn):
 
 
 def _mesh(light, edges, n, v, cos_o, turn, size):
-    """Light and edges of the cells above the horizon, and of those that it may cut."""
+    """Light and edges of cells above the horizon, and of cells that the horizon may cut."""
     done = [(light[:0], edges[:, :0], np.zeros(0, bool))]
     count = 0
     while edges.shape[1]:
@@ -115,7 +115,7 @@ def _mesh(light, edges, n, v, cos_o, turn, size):
         reach = r / np.maximum(length, 0.01)
         cut = reach > size * (np.maximum(theta_h - reach, 0.0) + 3e-4)
         cut |= r > size * (np.maximum(cos - r, 0.0) + cos_o + 3e-4)
-        # what is thrown back to the viewer, which the oracle does not look for
+        # light reflected back to the viewer, which the reference does not treat specially
         cut |= r > size * (np.maximum(np.linalg.norm(w - v, axis=-1) - r, 0.0) + 0.03)
         done.append((light[~cut], edges[:, ~cut], (np.abs(cos) < r)[~cut]))
         count += len(r)
@@ -141,7 +141,7 @@ def _mesh(light, edges, n, v, cos_o, turn, size):
 
 
 def _at_the_horizon(light, edges, up, slope):
-    """Cells in three: the horizon leaves the middle one through no side."""
+    """Divide cells in three by height: the horizon crosses the middle one corner to corner."""
     top, bottom, left, right = edges
     cross = [
         np.clip(np.mod(np.arctan2(-up, slope * np.cos(u)), math.pi), top, bottom)

@@ -15,8 +15,9 @@ from traitbrdf.transport.transport import Transport
 
 def over(transport: Transport, **arguments: Any) -> EditSession:
     """A new session over a prepared scene; what it trains is its own."""
-    again = Transport.restored(transport.scene, transport.grid, transport.arrays())
-    again._operator = transport._operator  # the rays are cast once
+    again = Transport.restored(
+        transport.scene, transport.grid, transport.arrays(), operator=transport.operator
+    )  # with the same operator, so that rays are cast once
     return EditSession(transport.scene, **{"quality": "preview", "transport": again, **arguments})
 
 

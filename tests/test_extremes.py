@@ -27,7 +27,6 @@ from traitbrdf.session.editing import EditSession
 from traitbrdf.space.embedding import GRID
 from traitbrdf.space.library import default_embedding, default_library
 from traitbrdf.space.traits import default_traits
-from traitbrdf.transport import lighttree
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import Operator
 from traitbrdf.transport.transport import Transport
@@ -209,8 +208,8 @@ def test_a_map_of_one_texel_is_a_furnace():
         np.testing.assert_allclose(shown, expected, rtol=5e-3)
 
 
-def test_blocks_of_texels_shine_as_their_texels(monkeypatch):
-    """For large maps a leaf of the tree is a block of texels; a cut can split it."""
+def test_blocks_of_texels_shine_as_their_texels():
+    """In large maps a leaf of the tree is a block of texels, which the walk cuts further."""
     rng = np.random.default_rng(0)
     image = 0.1 + rng.random((300, 602, 3)) ** 8
     image[100, 217] = 1e4
@@ -221,12 +220,11 @@ def test_blocks_of_texels_shine_as_their_texels(monkeypatch):
     fine = LightTree.build(environment)
     assert fine.block == 1
     plain = finite(Operator(scene, GRID).images(index, tables))
-    monkeypatch.setattr(lighttree, "_ROWS", 80)
-    coarse = LightTree.build(environment)
+    coarse = LightTree.build(environment, most_rows=80)
     assert coarse.block == 4
     assert len(coarse.radius) < 0.1 * len(fine.radius)
     np.testing.assert_allclose(coarse.moment[0], fine.moment[0], rtol=1e-6)
-    blocks = finite(Operator(scene, GRID).images(index, tables))
+    blocks = finite(Operator(scene, GRID, tree=coarse).images(index, tables))
     # the map's rows and columns are no multiples of 4: the last blocks are smaller
     error = np.abs(blocks - plain).mean(axis=(0, 1)) / plain.mean(axis=(0, 1))
     assert error.max() < 6e-3

@@ -1,4 +1,4 @@
-"""What log f may do along theta_h: no holes, no spikes, and nothing changed that has neither."""
+"""Profiles of log f along theta_h: holes and spikes are removed, all else stays."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def fields(logs):
 
 
 def garbage(seed, size=3.0):
-    """A member under noise."""
+    """A member of the library with noise."""
     rng = np.random.default_rng(seed)
     return (LIBRARY[rng.integers(len(LIBRARY))] + size * rng.normal(size=(3, GRID.size))).astype(
         np.float32
@@ -55,7 +55,7 @@ def garbage(seed, size=3.0):
 
 @pytest.mark.parametrize("i", range(len(MEMBERS)), ids=repr)
 def test_members_change_by_their_valleys_alone(i):
-    """Beyond the highlight, and wherever there is no valley in it, to the bit."""
+    """Values outside valleys of the highlight stay as they are."""
     kept, before = fields(PROFILES.keep(LIBRARY[i])), fields(LIBRARY[i])
     assert np.all(kept >= before - 1e-5)
     changed = np.abs(kept - before) > 1e-5
@@ -68,7 +68,7 @@ def test_members_change_by_their_valleys_alone(i):
 @few
 @given(seeds)
 def test_no_hole_in_any_highlight(seed):
-    """Up to 30 degrees: once a profile falls it does not rise again."""
+    """Up to 30 degrees, a profile that falls does not rise again."""
     kept = fields(PROFILES.keep(garbage(seed)))
     inner = PROFILES.inner.reshape(GRID.n_theta_d, GRID.n_phi_d)
     assert inner[TALL].any()
@@ -124,7 +124,7 @@ def test_sources_and_tensors_say_the_same(seed):
     point = torch.tensor(logs, requires_grad=True)
     tensor = PROFILES.keep(point)
     np.testing.assert_allclose(tensor.detach().numpy(), kept, rtol=1e-12, atol=1e-12)
-    # slopes: along a random direction, beside a difference
+    # the derivative along a random direction agrees with a finite difference
     rng = np.random.default_rng(seed)
     along = rng.normal(size=logs.shape)
     weight = rng.normal(size=logs.shape)
@@ -147,8 +147,7 @@ def test_the_shipped_library_may_rise_where_velvets_do():
 
 
 def test_a_dark_point_in_the_middle_is_no_velvet():
-    """What rises from theta_h = 0 alone is filled: the trend is counted from the brightest of the
-    first 10 degrees."""
+    """A dip at theta_h = 0 is filled: a rise counts from the maximum of the first 10 degrees."""
     spoilt = fields(LIBRARY[1]).copy()
     nodes = GRID.theta_h < math.radians(4.0)
     assert nodes.sum() >= 3

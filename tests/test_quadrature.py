@@ -1,4 +1,4 @@
-"""Rows of the operator: against the oracle, in light and in shadow."""
+"""Rows of the operator against the reference, in light and in shadow."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from traitbrdf.scene.teapot import teapot
 from traitbrdf.space.embedding import GRID
 from traitbrdf.space.library import default_library
 from traitbrdf.transport.lighttree import LightTree
-from traitbrdf.transport.operator import _FLAT, Operator, _core, _lobe
+from traitbrdf.transport.operator import FLAT, Operator, core_of, lobe_of
 from traitbrdf.transport.visibility import VisibilityCut
 
 LIBRARY = default_library()
@@ -32,25 +32,25 @@ GREY = np.full((GRID.size, 1), 1.0 / math.pi, np.float32)
 
 
 def flat(table):
-    """(cells, 3) of a table on the grid."""
+    """Values (cells, 3) of a table on the grid."""
     return np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
 
 
 def by_rows(operator, index, tables):
-    """(m, B, 3) radiance by the rows of fragments, in float64."""
+    """Radiance (m, B, 3) float64 from the rows of fragments."""
     columns = np.stack([flat(t) for t in tables], axis=1).astype(np.float64)
     rows = operator.rows(index).astype(np.float64)
     return np.einsum("pck,kbc->pbc", rows, columns, optimize=True)
 
 
 def diagonal(images):
-    """(m, T, 3) of images (m, 3, 3 T): each colour of the light under its own channel."""
+    """Radiance (m, T, 3) from images (m, 3, 3 T): each colour of light with its own channel."""
     each = images.reshape(*images.shape[:2], -1, 3)
     return np.einsum("pctc->ptc", each)
 
 
 def by_images(operator, index, tables):
-    """The same by the images of the tables' channels."""
+    """Radiance (m, B, 3) from the images of the tables' channels."""
     return diagonal(operator.images(index, channels(tables)))
 
 
@@ -59,12 +59,12 @@ def channels(tables):
 
 
 def errors(shown, true):
-    """(B,) mean relative L1 of radiance (m, B, 3)."""
+    """Mean relative L1 (B,) of radiance (m, B, 3)."""
     return np.abs(shown - true).mean(axis=(0, 2)) / true.mean(axis=(0, 2))
 
 
 def some(scene, count, seed=0, bordering=None, part=None):
-    """Random fragments: all kinds, or those in pixels at a border, or not; of a part."""
+    """Random fragments: of all parts or one; at borders, inside, or both."""
     chosen = np.ones(len(scene.pixels), bool)
     if bordering is not None:
         chosen &= scene.bordering == bordering
@@ -80,14 +80,14 @@ def noise(rows, columns, seed=0, **settings):
 
 
 def one_texel(row, column, rows, bright=1e4, rest=1e-3):
-    """A map with all its light, but for a faint rest, in one texel."""
+    """A map with nearly all its light in one texel."""
     image = np.full((rows, 2 * rows, 3), rest)
     image[row, column] = bright
     return EnvironmentMap(image)
 
 
 def shadowed(scene, index, count=256):
-    """Which fragments get less than nine tenths of the light that the horizon leaves them."""
+    """Which fragments get less than nine tenths of the light above their horizon."""
     toward = np.random.default_rng(9).normal(size=(count, 3))
     toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
     light = scene.environment.radiance(toward).mean(axis=-1)
@@ -151,7 +151,7 @@ def test_rows_with_shadows(make):
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_shadowed_fragments(make):
-    """Where a tenth of the light or more is hidden; by the images of a whole part as well."""
+    """Fragments that lose a tenth of their light or more; also in images of a whole part."""
     scene = make(56)
     ground = scene.parts.index("ground")
     span = scene.part_slice(ground)
@@ -204,7 +204,7 @@ def test_lights_alone(small_sphere):
     index = np.concatenate([some(scene, 40, bordering=False), some(scene, 10, bordering=True)])
     true, _ = reference.fragments(scene, index, TABLES)
     operator = Operator(scene, GRID)
-    # at borders some samples graze: what is next to nothing there need not agree to all digits
+    # at borders some samples graze: their tiny values need not agree to all digits
     for shown in (by_rows(operator, index, TABLES), by_images(operator, index, TABLES)):
         np.testing.assert_allclose(shown, true, rtol=1e-3, atol=1e-5 * true.max())
 
@@ -305,12 +305,12 @@ def test_turning_everything_changes_nothing(ground):
         sky = EnvironmentMap.sky(rows=32).rotated(turn)
         camera = Camera(math.degrees(turn), 15.0)
         scene = Scene(sphere(), sky, lights, camera, size=32, ground=ground)
-        # a sample at an edge may fall to either side by rounding
+        # rounding may move a sample at an edge to either side
         index = np.flatnonzero(~scene.bordering)[::16]
         shown.append((scene.pixels[index], by_rows(Operator(scene, GRID), index, TABLES)))
     (pixels, first), (turned, second) = shown
     np.testing.assert_array_equal(turned, pixels)
-    # rays that graze an edge decide by rounding too
+    # rounding also decides rays that graze an edge
     off = np.abs(second - first).max(axis=(1, 2)) > 2e-3 * first.max(axis=(1, 2))
     assert np.count_nonzero(off) <= (0.05 * len(off) if ground else 0)
     assert np.all(errors(second, first) < (5e-3 if ground else 5e-4))
@@ -318,7 +318,7 @@ def test_turning_everything_changes_nothing(ground):
 
 @pytest.mark.slow
 def test_samples_at_borders_have_shadows_of_their_own():
-    """Under a bright sun a border's samples are lit or not one by one; finer is nearer."""
+    """Under a bright sun each sample of a border is lit or not; higher resolution errs less."""
     image = np.full((32, 64, 3), 0.05)
     image[9, 20] = 300.0
     scene = Scene(teapot(), EnvironmentMap(image), camera=Camera.orbit(35.0, 25.0), size=64)
@@ -328,16 +328,16 @@ def test_samples_at_borders_have_shadows_of_their_own():
     print(f"borders: {np.median(found[0]):.4f} and, finer, {np.median(found[1]):.4f}")
     assert np.median(found[0]) < 0.02
     assert np.median(found[1]) < 0.006
-    # without them all samples see what the middle one does
+    # without own rays all samples see what the middle one sees
     blind = Operator(scene, GRID, 2.0)
-    blind._visibility.cast_samples = lambda index, fine: None
+    blind.visibility.cast_samples = lambda index, fine: None
     assert np.median(errors(by_images(blind, index, TABLES), true)) > 2.0 * np.median(found[1])
 
 
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_how_fragments_are_grouped_does_not_show(make):
     scene = make()
-    core = _core(GRID, channels(TABLES))
+    core = core_of(GRID, channels(TABLES))
     operator = Operator(scene, GRID, core=core)
     index = some(scene, 40)
     shuffled = np.random.default_rng(2).permutation(len(index))
@@ -350,7 +350,7 @@ def test_how_fragments_are_grouped_does_not_show(make):
     parts = [by_images(anew, few, TABLES) for few in np.split(index, [1, 8, 31])]
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-5, atol=1e-6 * level)
     np.testing.assert_allclose(by_rows(anew, index, TABLES), whole, rtol=1e-3, atol=1e-5 * level)
-    operator._capacity = 40  # too small for any fragment: enlarged as often as need be
+    operator.capacity = 40  # too small for any fragment, so it is doubled several times
     np.testing.assert_allclose(
         by_images(operator, index, TABLES), whole, rtol=1e-5, atol=1e-6 * level
     )
@@ -364,7 +364,7 @@ def test_how_fragments_are_grouped_does_not_show(make):
 
 @pytest.mark.parametrize("shadows", [False, True])
 def test_images_of_whole_parts(shadows):
-    """Far images are interpolated over some pixels: that must not show."""
+    """Far images are interpolated over some pixels, with an error too small to see."""
     scene = teapot_on_ground().changed(shadows=shadows)
     operator = Operator(scene, GRID)
     tables = channels(MANY)
@@ -384,13 +384,13 @@ def test_images_of_whole_parts(shadows):
 
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_rows_as_shown_are_those_of_the_images(make):
-    """With the same shadows and walks, whatever is asked for beside: a basis is fitted to them."""
+    """A basis is fitted to them, so they need the same shadows and leaves as the images."""
     scene = make()
-    operator = Operator(scene, GRID, core=_core(GRID, channels(TABLES)))
+    operator = Operator(scene, GRID, core=core_of(GRID, channels(TABLES)))
     index = some(scene, 60)
     rows = operator.rows_as_shown(index)
     found = np.einsum("mck,kt->mct", rows, channels(TABLES), optimize=True)
-    operator._exact_rules = operator._rules  # far images uninterpolated, but of the same leaves
+    operator.exact_rules = operator.rules  # not interpolated, but with the same leaves
     images = [
         operator.part_images(part, channels(TABLES), interpolate=False)
         for part in range(len(scene.parts))
@@ -405,7 +405,7 @@ def test_rows_as_shown_are_those_of_the_images(make):
 
 @pytest.mark.parametrize("make", [ball_on_ground, teapot_on_ground])
 def test_rows_do_not_depend_on_what_was_prepared(make):
-    """Rays that are spared once the fragments around have theirs must not be missed."""
+    """Fewer rays are cast once the fragments around have theirs; the rows hardly change."""
     scene = make()
     index = np.concatenate([some(scene, 60), some(scene, 60, part="ground")])
     alone = by_rows(Operator(scene, GRID), index, MANY)
@@ -432,10 +432,10 @@ def test_preparing_is_done_once_and_told():
     assert told[-1][1] == 1.0
     cast = scene.rays_cast
     assert cast > 0
-    # every sample of a border counts; some of them get all rays, of the others few
+    # all samples of a border count: some cast all rays, the others few
     count = np.diff(scene.offsets)[scene.pixel_part == 1].sum()
-    # neighbours see nearly the same: far fewer than one ray for each direction and sample
-    assert cast < 0.5 * 0.5 * count * len(operator._visibility.cut.share)
+    # neighbours share visibility: far fewer than one ray for each direction and sample
+    assert cast < 0.5 * 0.5 * count * len(operator.visibility.cut.share)
     operator.prepare(1)
     assert scene.rays_cast == cast
 
@@ -457,7 +457,7 @@ def test_progress_can_cancel():
 
 
 def lit(shown, cos):
-    """Whether fragments get the light whose full irradiance is proportional to `cos`."""
+    """Whether fragments get a light whose unshadowed irradiance is proportional to `cos`."""
     full = np.max(shown / cos)
     share = shown / (full * cos)
     assert np.all((share < 0.05) | (share > 0.95)), "half a shadow"
@@ -497,13 +497,13 @@ def test_a_small_sun_casts_a_shadow_sharp_to_the_pixel(shape, rows):
     ids=["directional", "point"],
 )
 def test_lights_cast_the_shadow_of_a_ball(light):
-    """In closed form: what of the ground the ball hides from a light."""
+    """The shadow of the ball on the ground, in closed form."""
     dark = EnvironmentMap(np.zeros((4, 8, 3)))
     scene = Scene(sphere(), dark, [light], Camera.orbit(20.0, 30.0), size=64, ground=True)
     index = np.flatnonzero((scene.pixel_part == 1) & ~scene.bordering)
     points = scene.positions[scene.offsets[index]]
     toward, irradiance = light.arriving(points)
-    along = np.sum(-points * toward, axis=-1)  # to the point next to the ball's centre
+    along = np.sum(-points * toward, axis=-1)  # to the point that is nearest to the ball's centre
     apart = np.linalg.norm(points + along[:, None] * toward, axis=-1)
     free = (along < 0.0) | (apart > 1.0)
     sure = np.abs(apart - 1.0) > 1e-6
@@ -520,7 +520,7 @@ def test_lights_cast_the_shadow_of_a_ball(light):
 
 
 def test_the_shadow_of_a_ball_under_a_grey_sky_is_soft():
-    """In closed form: under a uniform sky the ball takes its share of the irradiance."""
+    """The irradiance that the ball hides under a uniform sky, in closed form."""
     scene = Scene(sphere(), EnvironmentMap.uniform(rows=128), camera=Camera.orbit(0.0, 40.0),
                   size=64, ground=True)  # fmt: skip
     index = some(scene, 150, bordering=False, part="ground")
@@ -591,11 +591,11 @@ def test_visibility_cut(environment, spacing, share):
     np.testing.assert_allclose(np.linalg.norm(cut.directions, axis=-1), 1.0, atol=1e-6)
     flux = np.linalg.norm(tree.moment.sum(axis=1, dtype=np.float64), axis=-1)
     if environment.image.any():
-        # light of one node comes from several directions, which cancels by a little
+        # the directions of a node's light differ, so its vector irradiance is a little shorter
         assert 1.0 - spacing**2 < cut.share.sum() < 1.0 + 1e-5
     else:
         assert cut.share.sum() == 0.0
-    # ranges nest: the children of a node share its range out, or have all of it below the cut
+    # ranges nest: the children of a node divide its range, or share it below the cut
     assert (cut.first[0], cut.last[0]) == (0, count)
     reached = np.zeros(len(flux), bool)
     reached[0] = True
@@ -629,7 +629,7 @@ def test_visibility_cut(environment, spacing, share):
         angle = np.linalg.norm(tree.direction[leaves] - cut.directions[cut.first[leaves]], axis=-1)
         assert np.all(angle[several] < 2.0 * spacing)
         assert np.all(angle[~several] < 1e-6)
-        # only single texels are brighter than asked for
+        # only single texels may be brighter than the limit
         assert np.all((cut.share <= 1.001 * share) | (owners == 1))
     assert cut.neighbours.shape == (count, 6)
     assert cut.neighbours.min() >= 0
@@ -638,7 +638,7 @@ def test_visibility_cut(environment, spacing, share):
         assert np.all(cut.neighbours != np.arange(count)[:, None])
 
 
-# -- what is refused --------------------------------------------------------------------------
+# -- errors -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("resolution", [0.0, -1.0, math.nan, math.inf])
@@ -662,30 +662,30 @@ def test_a_light_tree_at_hand_is_used(shape, small_sphere):
     np.testing.assert_array_equal(operator.rows(index), other.rows(index))
 
 
-# -- as fine as a scene requires --------------------------------------------------------------
+# -- leaves as fine as lobes require ----------------------------------------------------------
 
 
 def test_lobes_as_wide_as_their_tables_are(small_sphere):
     angles = GRID.theta_h[:, None, None, None]
     for width in (0.05, 0.2):
         inside = 2.0 - np.clip(angles - width, 0.0, 1.0) + np.zeros((*GRID.shape, 1))
-        found = _lobe(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
-        # within it they change by no more than is allowed
-        assert width <= found <= width + 1.2 * _FLAT * 2.0
-    assert _lobe(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
+        found = lobe_of(GRID, inside.reshape(-1, 1).astype(np.float32), 1.5)
+        # tables change within it by no more than FLAT
+        assert width <= found <= width + 1.2 * FLAT * 2.0
+    assert lobe_of(GRID, GREY, 1.5) == pytest.approx(0.5 * math.pi)
     noise = np.random.default_rng(0).random((GRID.size, 2), dtype=np.float32)
-    assert _lobe(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
+    assert lobe_of(GRID, np.concatenate([noise, GREY[:, :1]], axis=1), 1.5) == 0.0
 
 
 def test_what_views_never_see_does_not_narrow_lobes():
     table = np.ones((*GRID.shape, 1), np.float32)
     table[:3, GRID.theta_d > 1.4] = 100.0
-    assert _lobe(GRID, table.reshape(-1, 1), 1.5) < 0.01
-    assert _lobe(GRID, table.reshape(-1, 1), 0.9) > 1.5
+    assert lobe_of(GRID, table.reshape(-1, 1), 1.5) < 0.01
+    assert lobe_of(GRID, table.reshape(-1, 1), 0.9) > 1.5
 
 
 def test_wide_lobes_have_far_images_alone():
-    """Nothing is told as near, there are fewer leaves, and the picture is as right as before."""
+    """No near images are computed, and the error stays below 1 %."""
     scene = ball_on_ground()
     operator = Operator(scene, GRID)
     for part in range(2):
@@ -704,4 +704,4 @@ def test_flat_parts_interpolate_narrower_lobes():
     operator = Operator(ball_on_ground(96), GRID)
     operator.prepare(0)
     operator.prepare(1)
-    assert operator._plans[1].scale < operator._plans[0].scale <= 1.0
+    assert operator.plan(1).scale < operator.plan(0).scale <= 1.0

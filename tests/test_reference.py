@@ -1,4 +1,4 @@
-"""The oracle against closed forms, against itself refined, and against the laws of light."""
+"""The reference against closed forms, against finer meshes, and against the laws of light."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, PointLight,
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import Mesh, sphere
 
-# resolves the sharpest lobe here, width 0.002, where the nodes of a table do not
+# resolves the sharpest lobe here, of width 0.002, which the nodes of a table do not
 FINE = np.unique(np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 60), np.linspace(0.05, 1.57, 60)]))
 
 
@@ -91,7 +91,7 @@ def test_sharp_lobes_in_the_furnace(model):
 
 
 def test_sharp_lobe_under_a_map_with_edges():
-    """Half the sky lit: a lobe that the edge halves shows half of its albedo."""
+    """Half the sky is lit: a lobe centred on its edge reflects half of its albedo."""
     image = np.zeros((8, 16, 3))
     image[:, 8:] = 1.0  # from -z over +x to +z
     model = TorranceSparrowSimplified(k_s=1.0, s=0.002)
@@ -104,7 +104,7 @@ def test_sharp_lobe_under_a_map_with_edges():
 @pytest.mark.parametrize("name", ["studio", "forest"])
 def test_lambert_shows_the_irradiance_of_real_maps(shared_data, name):
     environment = EnvironmentMap.read(shared_data / "envmaps" / f"{name}.exr").rotated(0.7)
-    # `irradiance` lets the horizon cut no texel: smaller texels, the same light
+    # `irradiance` never cuts a texel at the horizon, so give it smaller texels of the same light
     fine = EnvironmentMap(environment.image.repeat(3, axis=0).repeat(3, axis=1), 0.7)
     normals, views = points(3, seed=2)
     k_d = np.array([0.9, 0.5, 0.1])
@@ -187,7 +187,7 @@ def test_radiance_is_linear_in_the_table():
 
 
 def test_a_table_is_what_its_eval_says():
-    """Tables share a path of their own through the integrator: it must not matter."""
+    """The integrator sums tables in another way than models: the results agree."""
     table = TabulatedBRDF.from_model(Plastic(alpha=0.2), HalfDiffGrid(20, 8, 5))
     other = TabulatedBRDF.from_model(Lambert(0.2), HalfDiffGrid(10, 6, 12, "merl"))
     disguised = types.SimpleNamespace(eval=table.eval, mirror=table.mirror)
@@ -230,7 +230,7 @@ def test_light_below_the_horizon_gives_nothing():
 
 
 def test_light_that_only_grazes_the_surface():
-    """One lit row, whose middle lies below the horizon; its upper part still shines."""
+    """The middle of the one lit row is below the horizon, but its upper part is above."""
     image = np.zeros((9, 2, 3))
     image[4] = 1.0  # polar angles from 80 to 100 degrees
     tilt = math.radians(-2.0)
@@ -252,7 +252,7 @@ def test_texels_at_the_poles_are_not_lost_at_the_horizon(row):
     environment = EnvironmentMap(image)
     middle = math.pi / 16 if row == 0 else math.pi * 15 / 16
     azimuth = 2.0 * math.pi * 3.5 / 16
-    t = middle + math.pi / 2 * (1 if row == 0 else -1) * 1.1  # the middle is out of sight
+    t = middle + math.pi / 2 * (1 if row == 0 else -1) * 1.1  # the middle is below the horizon
     normal = np.array(
         [[-math.sin(t) * math.sin(azimuth), math.cos(t), math.sin(t) * math.cos(azimuth)]]
     )
@@ -273,11 +273,11 @@ def test_texels_at_the_poles_are_not_lost_at_the_horizon(row):
 
 
 def refined(environment, normals, views, models, resolution=0.05):
-    evaluate = reference._Evaluator(models)
-    texels = reference._Cells.texels(environment.image)
+    evaluate = reference.Evaluator(models)
+    texels = reference.Cells.texels(environment.image)
     return np.array(
         [
-            reference._integrate(texels, n, v, evaluate, resolution)
+            reference.integrate(texels, n, v, evaluate, resolution)
             for n, v in zip(normals, views, strict=True)
         ]
     )
@@ -295,14 +295,14 @@ def test_stated_error_contains_the_truth(monkeypatch, seed):
     ]
     normals, views = points(2, seed=seed)
     values, error = reference.radiance(normals, views, models, environment, tolerance=1e-4)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    monkeypatch.setattr(reference, "MAX_CELLS", 10_000_000)
     truth = refined(environment, normals, views, models)
     assert np.all(np.abs(values - truth) <= error)
     assert np.all(error.max(-1) <= 1e-4 * values.max(-1))
 
 
 def random_brdf(rng):
-    """A model or table from a wide space, many of them sharp."""
+    """Draw a model or table of any kind; many are sharp."""
 
     def between(low, high):
         return float(np.exp(rng.uniform(math.log(low), math.log(high))))
@@ -364,7 +364,7 @@ def random_view(rng):
 
 
 def closed_forms(rng, tolerance):
-    """Stated and true errors of cases whose answer needs no mesh: (kind, error (3,), off (3,))."""
+    """Stated and true errors of cases with a closed form: (kind, error (3,), off (3,))."""
     normal, view = random_view(rng)
     while cosine(normal, view)[0] < 0.15:
         normal, view = random_view(rng)
@@ -401,32 +401,33 @@ def closed_forms(rng, tolerance):
 
 
 def finer_runs(rng, tolerance, monkeypatch):
-    """The same of BRDFs at one point, against `finer` and else a mesh of ten times the cells.
+    """The same for BRDFs at one point, against `finer`, or else a mesh of ten times the cells.
 
-    None stands for a refusal, and NaN for a truth that is not to be had.
+    None stands for a refusal, and NaN for a true value that could not be computed.
     """
     environment = random_light(rng)
     normal, view = random_view(rng)
     brdfs = [random_brdf(rng) for _ in range(3)]
-    visible, cell = None, 0.1
+    visible, shadows, cell = None, None, 0.1
     if rng.random() < 0.2:
         axis, bound = rng.normal(size=3), rng.uniform(-0.5, 0.9)
         axis /= np.linalg.norm(axis)
         visible = lambda point, w: w @ axis < bound  # noqa: E731
+        shadows = reference.Shadows(visible, cell)
     groups = [[brdf] for brdf in brdfs] if rng.random() < 0.4 else [brdfs]
     results, resolutions = [], []
-    integrate = reference._integrate
+    integrate = reference.integrate
 
     def watched(*args):
         resolutions.append(args[4])
         return integrate(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(reference, "_integrate", watched)
+        patch.setattr(reference, "integrate", watched)
         for group in groups:
             try:
                 values, error = reference.radiance(
-                    normal, view, group, environment, (), None, tolerance, visible, cell
+                    normal, view, group, environment, (), None, tolerance, shadows
                 )
             except reference.IntegrationError:
                 yield "refused", None, None
@@ -436,15 +437,15 @@ def finer_runs(rng, tolerance, monkeypatch):
     if not results:
         return
     if visible is None:
-        cells = reference._Cells.texels(environment.image)
+        cells = reference.Cells.texels(environment.image)
     else:
-        cells = reference._Pieces(environment, cell).seen(0, normal[0], visible)
+        cells = reference.Pieces(environment, cell).seen(0, normal[0], visible)
     n, v = (np.asarray(environment.to_map(w[0]), np.float64) for w in (normal, view))
     allowed = np.array([0.05 * error.max() for _, _, error, _ in results])
     truth = finer.settled(cells, n, v, [brdf for brdf, *_ in results], allowed)
     for (brdf, value, error, last), true in zip(results, truth, strict=True):
         if np.isnan(true).any():
-            evaluate = reference._Evaluator([brdf])
+            evaluate = reference.Evaluator([brdf])
             run = integrate(cells, n, v, evaluate, last / 3.3)
             true = np.full(3, np.nan) if run is None else run[0]
         kind = "table" if isinstance(brdf, TabulatedBRDF) else type(brdf).__name__
@@ -453,9 +454,9 @@ def finer_runs(rng, tolerance, monkeypatch):
 
 @pytest.mark.slow
 def test_stated_error_contains_the_truth_in_a_thousand_cases(monkeypatch):
-    """99 % of what a user may ask, closed forms and finer runs, and no gross miss that is seen.
+    """99 % of random cases hold, and no visible error exceeds four times the stated one.
 
-    A quarter of the stated errors would hold 97 %.
+    Errors stated at a quarter of their size would hold in 97 %.
     """
     rng = np.random.default_rng(20)
     cases, refused, unknown, settings = [], 0, 0, 0
@@ -470,7 +471,7 @@ def test_stated_error_contains_the_truth_in_a_thousand_cases(monkeypatch):
             elif np.isnan(off).any():
                 unknown += 1
             else:
-                seen = np.maximum(off - 1e-20, 0.0)  # the tails of lobes are not
+                seen = np.maximum(off - 1e-20, 0.0)  # far tails of lobes are not visible
                 within, nearly = bool(np.all(off <= error)), bool(np.all(seen <= 4.0 * error))
                 cases.append((kind, within, nearly))
     cases = cases[:1000]
@@ -489,7 +490,7 @@ def test_a_grazing_view_meets_the_tolerance(monkeypatch):
     views = cos * normals + math.sqrt(1 - cos * cos) * across / np.linalg.norm(across)
     environment, models = random_map(), [GGX(alpha=0.1), Lambert(0.5)]
     values, error = reference.radiance(normals, views, models, environment)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 10_000_000)
+    monkeypatch.setattr(reference, "MAX_CELLS", 10_000_000)
     truth = refined(environment, normals, views, models, 0.08)
     assert np.all(np.abs(values - truth) <= error)
 
@@ -505,14 +506,14 @@ def test_a_looser_tolerance_is_met_and_stated():
 
 def test_refuses_rather_than_lies(monkeypatch):
     normals, views = points(2)
-    monkeypatch.setattr(reference, "_MAX_CELLS", 500)
+    monkeypatch.setattr(reference, "MAX_CELLS", 500)
     with pytest.raises(reference.IntegrationError, match="point 0: more than 500 cells needed"):
         reference.radiance(normals, views, [GGX(alpha=0.01)], random_map())
 
 
 def test_refuses_what_no_mesh_resolves(monkeypatch):
-    """A reflectance that is noise never converges: it must end, and in a refusal."""
-    monkeypatch.setattr(reference, "_MAX_CELLS", 40_000)
+    """Integrating a reflectance that is noise never converges: it ends with an error."""
+    monkeypatch.setattr(reference, "MAX_CELLS", 40_000)
     rng = np.random.default_rng(0)
     noise = types.SimpleNamespace(eval=lambda wi, wo: rng.random(wi.shape), mirror=np.zeros(3))
     normals, views = points(1)
@@ -553,7 +554,7 @@ def inner_fragments(scene, part, count, seed=0):
 
 
 def sphere_hides(scene, toward, distance=np.inf):
-    """Whether the sphere stands before directions (n, 3) from all samples, and by what margin."""
+    """Whether the sphere hides directions (n, 3) from all samples, and by what margin."""
     offset = scene.positions - scene.shape.center
     along = -np.sum(offset * toward, axis=-1)
     nearest = np.linalg.norm(offset + along[:, None] * toward, axis=-1) / scene.shape.radius
@@ -569,7 +570,7 @@ def sphere_hides(scene, toward, distance=np.inf):
     ids=["directional", "point"],
 )
 def test_shadow_of_a_sphere_on_the_ground(light):
-    """Every sample, of the sphere too: the closed form, or nothing at all in the shadow."""
+    """Every sample has the closed form, or is black in the shadow; those of the sphere, too."""
     scene = over_the_ground(lights=[light], size=40)
     if isinstance(light, PointLight):
         offset = np.array(light.position) - scene.positions
@@ -588,7 +589,7 @@ def test_shadow_of_a_sphere_on_the_ground(light):
     )
     index = np.arange(len(scene.pixels))
     sample, owner, share = scene.samples(index)
-    # on the very edge of the shadow it is for rounding to decide
+    # rounding decides exactly at the edge of the shadow
     sure = np.bincount(owner, (margin < 1e-4) & ground) == 0
     assert np.mean(~sure) < 0.01
     assert 30 < np.count_nonzero(hidden & ground) < 0.5 * np.count_nonzero(ground)
@@ -645,12 +646,12 @@ def test_smaller_pieces_come_nearer():
 
 
 def test_a_sun_of_one_texel_casts_a_sharp_shadow():
-    """At 256 rows a texel is one piece: all of it is seen or nothing, as from its centroid."""
+    """At 256 rows a texel is one piece, visible or hidden as its centroid is."""
     image = np.zeros((256, 512, 3))
     image[60, 100] = 1000.0
     environment = EnvironmentMap(image, 0.3)
     scene = over_the_ground(environment)
-    # light from one place: its irradiance on planes along the axes tells where
+    # the irradiance on planes along the axes gives the direction of a single light
     moment = (environment.irradiance(np.eye(3)) - environment.irradiance(-np.eye(3)))[:, 0]
     toward = moment / np.linalg.norm(moment)
     hidden, margin = sphere_hides(scene, toward)
@@ -678,7 +679,9 @@ def test_hidden_texels_are_as_good_as_black(angle):
         assert point.shape == w.shape[:1]
         return turn_about_y(w, -angle)[:, 0] > 0.0
 
-    shaded, error = reference.radiance(normals, views, models, environment, visible=visible)
+    shaded, error = reference.radiance(
+        normals, views, models, environment, shadows=reference.Shadows(visible)
+    )
     black, _ = reference.radiance(normals, views, models, EnvironmentMap(image, angle))
     np.testing.assert_allclose(shaded, black, rtol=1e-6)
     assert np.all(error.max(-1) <= 1e-4 * shaded.max(-1))
@@ -689,11 +692,19 @@ def test_nothing_hidden_is_no_shadow():
     normals, views = points(3)
     free, _ = reference.radiance(normals, views, models, environment)
     seen, _ = reference.radiance(
-        normals, views, models, environment, visible=lambda point, w: np.ones(len(w), bool)
+        normals,
+        views,
+        models,
+        environment,
+        shadows=reference.Shadows(lambda point, w: np.ones(len(w), bool)),
     )
     np.testing.assert_allclose(seen, free, rtol=1e-6)
     dark, error = reference.radiance(
-        normals, views, models, environment, visible=lambda point, w: np.zeros(len(w), bool)
+        normals,
+        views,
+        models,
+        environment,
+        shadows=reference.Shadows(lambda point, w: np.zeros(len(w), bool)),
     )
     np.testing.assert_array_equal(dark, 0.0)
     np.testing.assert_array_equal(error, 0.0)
@@ -710,7 +721,9 @@ def test_rays_go_only_where_light_may_come_from():
         return np.ones(len(w), bool)
 
     environment = EnvironmentMap(image, 0.4)
-    reference.radiance(normals, views, [Lambert(1.0)], environment, visible=visible)
+    reference.radiance(
+        normals, views, [Lambert(1.0)], environment, shadows=reference.Shadows(visible)
+    )
     point, w = (np.concatenate(both) for both in zip(*asked, strict=True))
     assert np.all(environment.radiance(w) > 0.0)
     assert np.all(cosine(normals[point], w) > -0.02)
@@ -721,7 +734,7 @@ def test_rays_go_only_where_light_may_come_from():
 
 
 def test_a_mirror_shows_the_wall_black():
-    """One ray in the mirror direction tells whether the map is seen in the floor."""
+    """One ray in the mirror direction decides whether the floor reflects the map."""
     environment = random_map(seed=5)
     scene = beside_a_wall(environment, subsamples=1)
     index = inner_fragments(scene, "floor", 50)
@@ -763,12 +776,12 @@ def test_the_size_of_the_world_does_not_matter(scale):
         part = first.parts[0] if make is beside_a_wall else "ground"
         index = inner_fragments(first, part, 10)
         a, b = (reference.fragments(s, index, [Lambert(0.5)])[0] for s in (first, second))
-        # rounding may turn the answer of a ray along an edge: one piece in a hundred thousand
+        # rounding may change the result of a ray along an edge: one piece in a hundred thousand
         np.testing.assert_allclose(b, a, rtol=2e-4)
 
 
 def test_nothing_is_asked_where_nothing_can_fall(monkeypatch):
-    """A sphere alone hides no light from itself: not a question, and the same as unshadowed."""
+    """A sphere alone hides no light from itself: no ray is cast, and shadows change nothing."""
     environment = random_map()
     scene = Scene(sphere(), environment, camera=Camera.orbit(20.0, 10.0), size=8)
     index = np.arange(0, len(scene.pixels), 15)
@@ -784,7 +797,8 @@ def test_nothing_is_asked_where_nothing_can_fall(monkeypatch):
 def test_pieces_need_a_size(cell):
     normals, views = points(1)
     with pytest.raises(ValueError, match="shadow_cell: expected an angle above 0 radians, got"):
-        reference.radiance(normals, views, [Lambert()], random_map(), shadow_cell=cell)
+        shadows = reference.Shadows(lambda point, w: np.ones(len(w), bool), cell)
+        reference.radiance(normals, views, [Lambert()], random_map(), shadows=shadows)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -793,13 +807,13 @@ def test_pieces_need_a_size(cell):
 
 @pytest.fixture(scope="module")
 def lit_scene():
-    """Borders, ground and a lamp; 4 x 5 pixels."""
+    """A scene of 4 x 5 pixels with borders, ground and a lamp."""
     lamp = PointLight((0.0, 5.0, 0.0), (9.0, 9.0, 9.0))
     return over_the_ground(random_map(), [lamp], size=(4, 5), subsamples=4)
 
 
 def test_a_fragment_is_the_sum_of_its_samples(lit_scene):
-    """Its share of the pixel, sample by sample, whichever way it is asked for."""
+    """Each sample adds its share of the pixel, in any order of fragments."""
     scene, models = lit_scene, [Lambert(0.9), GGX(alpha=0.3)]
     several = np.flatnonzero(np.diff(scene.offsets) > 1)
     index = several[[3, 0, 5, 3, -1]]
@@ -812,9 +826,9 @@ def test_a_fragment_is_the_sum_of_its_samples(lit_scene):
             models,
             scene.environment,
             [scene.arriving(light, rows) for light in scene.lights],
-            visible=lambda point, w, rows=rows: scene.visible(rows[point], w),
+            shadows=reference.Shadows(lambda point, w, rows=rows: scene.visible(rows[point], w)),
         )
-        # of the four samples of its pixel, those that hit the part
+        # the samples that hit the part, of the four of its pixel
         np.testing.assert_allclose(value, each.sum(axis=0) / 4.0, rtol=1e-6)
         np.testing.assert_allclose(stated, errors.sum(axis=0) / 4.0, rtol=1e-3)
 

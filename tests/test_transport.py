@@ -1,10 +1,11 @@
-"""Transport: frames against exact ones, errors that are told, and what a build holds."""
+"""Transport: frames against exact ones, measured errors, and what a preparation stores."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,12 +35,12 @@ TABLES = [LIBRARY[name] for name in NAMES]
 
 
 def flat(table):
-    """(cells, 3) of a table on the grid."""
+    """Values (cells, 3) of a table on the grid."""
     return np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
 
 
 def seen(built, table):
-    """(n, 3) of a table at the cells that the scene sees."""
+    """Values (n, 3) of a table at the cells that the scene sees."""
     return torch.from_numpy(flat(table)[built.cells]).to(built.device)
 
 
@@ -52,7 +53,7 @@ def frames(built, table):
 
 
 def exactly(built, tables, part=0):
-    """(P, 3) radiance of a part for each table, by all its fragments' own leaves."""
+    """Radiance (P, 3) of a part for each table; each fragment has leaves of its own."""
     columns = np.concatenate([flat(t) for t in tables], axis=1)
     span = built.scene.part_slice(part)
     images = built.operator.images(np.arange(span.start, span.stop), columns)
@@ -67,10 +68,9 @@ def relative(frame, exact):
 
 
 def copied(built):
-    """An equal transport whose training leaves the other alone."""
-    again = Transport.restored(built.scene, GRID, built.arrays())
-    again._operator = built._operator  # the rays are cast once
-    return again
+    """An equal transport; training it does not change the first."""
+    # with the same operator, so that rays are cast once
+    return Transport.restored(built.scene, GRID, built.arrays(), operator=built.operator)
 
 
 def ball(size=32, rows=32, **settings):
@@ -86,7 +86,7 @@ def built(small_sphere, training):
 
 @pytest.fixture(scope="module")
 def on_ground(training):
-    """With shadows, on a ground that receives them, and two lights beside the map."""
+    """A ball that casts shadows on the ground, under a map and two more lights."""
     lights = [
         PointLight(position=(3.0, 4.0, 3.0), intensity=(20.0, 18.0, 15.0)),
         DirectionalLight(direction=(-1.0, 2.0, 0.7), irradiance=(0.3, 0.4, 0.6)),
@@ -96,7 +96,7 @@ def on_ground(training):
 
 @pytest.fixture(scope="module")
 def outsiders():
-    """Tables unlike anything that the bases are trained with."""
+    """Tables unlike all training tables."""
     noise = np.random.default_rng(5).normal(size=(*GRID.shape, 3))
     angle, _, _ = GRID.node_angles()
     rings = 0.02 + np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / 0.3) / 0.4) ** 2)
@@ -113,7 +113,7 @@ def outsiders():
 
 
 def test_frames_of_library_members(built):
-    tables = [LIBRARY[name] for name in LIBRARY.names[3::40]]  # the bases know every sixth
+    tables = [LIBRARY[name] for name in LIBRARY.names[3::40]]  # every sixth is a training table
     shown = [shade(built, table) for table in tables]
     exact = exactly(built, tables)
     errors = [relative(f, e) for f, e in zip(shown, exact, strict=True)]
@@ -122,7 +122,7 @@ def test_frames_of_library_members(built):
           f"worst {max(errors):.4f}; measured {np.median(measured):.4f}")  # fmt: skip
     assert np.median(errors) < 0.01
     assert np.quantile(errors, 0.9) < 0.05
-    assert max(errors) < 0.1  # the most saturated flakes, by no more images than these
+    assert max(errors) < 0.1  # the worst are the most saturated flakes, at this low rank
     assert 0.3 * np.median(errors) < np.median(measured) < 3.0 * np.median(errors)
 
 
@@ -192,7 +192,7 @@ def test_radiance_is_linear_and_differentiable(on_ground):
         weight = torch.rand(one.shape, generator=torch.Generator().manual_seed(part))
         table = first.clone().requires_grad_()
         (weight * on_ground.radiance(part, table)).sum().backward()
-        # of a linear function the slope along any direction is its value there
+        # the derivative of a linear function along a direction is its value at that direction
         assert float((table.grad * second).sum()) == pytest.approx(
             float((weight * two).sum()), rel=1e-3
         )
@@ -203,7 +203,7 @@ def test_the_exact_frame_is_the_operator_s(built):
     frame = built.shade_exactly(0, chrome)
     images = built.operator.part_images(0, chrome, interpolate=False)
     np.testing.assert_allclose(frame.radiance, np.einsum("pcc->pc", images), rtol=1e-6)
-    # far images are interpolated, and the probes stand for finer light
+    # far images are interpolated, while the probes use finer leaves
     assert relative(frame, exactly(built, [LIBRARY["chrome"]])[0]) < 0.005
     assert 0.0 < frame.error < 0.01
     assert frame.level == pytest.approx(float(frame.radiance.mean()), rel=0.5)
@@ -242,7 +242,7 @@ def test_a_perfect_mirror_shows_the_map(on_ground):
 
 
 def test_composed_frames(on_ground):
-    """Every pixel is the sum of its fragments and of what is left of the backdrop."""
+    """A pixel is the sum of its fragments and of the uncovered backdrop."""
     scene = on_ground.scene
     shown = frames(on_ground, LIBRARY["gold-satin"])
     image = on_ground.compose(shown)
@@ -269,7 +269,7 @@ def test_the_frame_s_error_is_its_parts(on_ground):
 
 @pytest.mark.parametrize("grey_light", [True, False])
 def test_grey_light_takes_one_channel(grey_light, training, monkeypatch):
-    """It gives what three channels give, from a third of the numbers."""
+    """One channel gives the same frames as three, from a third of the numbers."""
     image = np.random.default_rng(3).uniform(0.1, 2.0, (16, 32, 1)) * np.ones(3)
     colour = (2.0, 2.0, 2.0) if grey_light else (2.0, 2.1, 2.0)
     lights = [DirectionalLight((0.3, 1.0, 0.5), colour)]
@@ -279,7 +279,7 @@ def test_grey_light_takes_one_channel(grey_light, training, monkeypatch):
     assert len(one.arrays()["rows_0"]) == (1 if grey_light else 3)
     if not grey_light:
         return
-    monkeypatch.setattr("traitbrdf.transport.transport._is_grey", lambda scene: False)
+    monkeypatch.setattr("traitbrdf.transport.transport.is_grey", lambda scene: False)
     three = Transport(scene, GRID, training, rank=24)
     assert 2.0 * one.bytes < three.bytes
     for table in TABLES:
@@ -310,7 +310,7 @@ def test_frames_on_cuda_are_those_of_the_cpu(on_ground):
         )
 
 
-# -- what a build holds -----------------------------------------------------------------------
+# -- what a preparation stores ----------------------------------------------------------------
 
 
 def test_what_a_build_holds(built, small_sphere):
@@ -322,14 +322,14 @@ def test_what_a_build_holds(built, small_sphere):
     # one basis serves the three colours
     assert 8 <= q.shape[1] <= 24
     assert q.shape[0] == len(small_sphere.pixels)
-    # orthonormal but for the pixels that were damped, where it is larger: no image got lost
+    # orthonormal except at damped pixels, where it is larger: no image is missing
     assert torch.isfinite(q).all()
     assert ((q**2).sum(dim=0) > 0.999).all()
     assert torch.linalg.matrix_rank(q) == q.shape[1]
 
 
 def test_rays_are_cast_once(training):
-    """Behind, for the next part, while another one is shaded: by one operator."""
+    """A thread casts the rays of the next part while another part is shaded."""
     cast = []
     for _ in range(3):
         scene = ball(24)
@@ -340,7 +340,7 @@ def test_rays_are_cast_once(training):
     for part in range(len(scene.parts)):
         operator.prepare(part)
     assert cast[0] == cast[1] == cast[2]
-    # the subset and the probes have rays of their own
+    # the subset and the probes cast rays of their own
     assert scene.rays_cast < cast[0] < 20 * scene.rays_cast
 
 
@@ -359,7 +359,7 @@ def test_cells_that_nobody_sees_do_not_count(built):
     changed[built.cells] = table[built.cells]
     other = TabulatedBRDF(GRID, changed.reshape(*GRID.shape, 3))
     whole, without = exactly(built, [LIBRARY["blue-plastic"], other])
-    # cells that only pixels outside the fit touch are few
+    # few cells are touched only by pixels outside the fit
     assert float((without - whole).abs().mean()) < 0.01 * float(whole.mean())
 
 
@@ -408,7 +408,7 @@ def test_odd_arrays_are_refused(built, on_ground):
 @pytest.fixture(scope="module")
 def fixed(on_ground, training):
     ground = flat(LIBRARY["concrete"])
-    return Transport(on_ground.scene, GRID, training, rank=24, fixed={1: ground})
+    return Transport(on_ground.scene, GRID, replace(training, fixed={1: ground}), rank=24)
 
 
 def test_a_fixed_part_is_shown_in_its_material(fixed, on_ground):
@@ -433,7 +433,7 @@ def test_a_freed_transport_is_that_without_fixed_parts(fixed, on_ground, trainin
     assert told
     expected = on_ground.arrays()
     for name, value in free.arrays().items():
-        if name.endswith("_0"):  # the shape's: those of the same rays
+        if name.endswith("_0"):  # of the shape, whose rays are the same
             np.testing.assert_array_equal(value, before[name], err_msg=name)
         else:
             np.testing.assert_array_equal(value, expected[name], err_msg=name)
@@ -455,14 +455,14 @@ def test_odd_fixed_tables_are_refused(fixed, training):
     table = flat(LIBRARY["concrete"])
     for odd in ({2: table}, {-1: table}, {1: table[:, :2]}, {1: table[:-1]}):
         with pytest.raises(ValueError, match="fixed"):
-            Transport(fixed.scene, GRID, training, rank=8, fixed=odd)
+            Transport(fixed.scene, GRID, replace(training, fixed=odd), rank=8)
 
 
 # -- training ---------------------------------------------------------------------------------
 
 
 def test_training_takes_a_table_in(built, outsiders):
-    """A table outside the span is then shown by the basis, and the others as well as before."""
+    """The basis then shows a table from outside its span, and all others as well as before."""
     exact = exactly(built, [*outsiders, *TABLES])
     before = [relative(shade(built, t), e) for t, e in zip(TABLES, exact[3:], strict=True)]
     for k, table in enumerate(outsiders):
@@ -520,7 +520,7 @@ def test_a_draft_is_as_good_as_it_says(training):
         assert image.dtype == np.float32
         assert np.isfinite(image).all()
         assert image.min() >= 0.0
-        # what the fragments of whole pixels show
+        # fragments that fill their pixels
         whole = small.weights[index] == 1.0
         shown = image.reshape(-1, 3)[small.pixels[index[whole]]]
         errors.append(reference.relative_error(shown, true[whole, i]))
@@ -590,7 +590,7 @@ def test_light_of_one_colour(training):
 
 
 def test_a_uniform_map_has_few_dimensions(training):
-    """Every pixel of a view angle looks the same: most of the basis vanishes."""
+    """All pixels at one view angle look the same, so the basis has few images."""
     scene = Scene(sphere(), EnvironmentMap.uniform(rows=32), size=24)
     built = Transport(scene, GRID, training, rank=64)
     for table, exact in zip(TABLES, exactly(built, TABLES), strict=True):
@@ -613,14 +613,14 @@ def test_a_few_pixels(size, training):
             assert frame.radiance.shape == (count, 3)
             assert torch.isfinite(frame.radiance).all()
             assert math.isfinite(frame.error)
-            if 0 < count < 4:  # nothing is kept apart, and nothing is lost
+            if 0 < count < 4:  # a part of few fragments
                 assert relative(frame, exact) < 5e-3
     image = built.compose(frames(built, LIBRARY["chrome"]))
     assert image.shape == (size, size, 3)
 
 
 def test_parts_of_a_few_pixels_and_of_none(training):
-    camera = Camera.orbit(0.0, 90.0)  # from above: no bottom
+    camera = Camera.orbit(0.0, 90.0)  # from above, where the bottom is not visible
     scene = Scene(teapot(), EnvironmentMap.sky(rows=32), camera=camera, size=12)
     counts = [len(scene.pixels[scene.part_slice(i)]) for i in range(len(scene.parts))]
     assert min(counts) == 0
@@ -682,7 +682,7 @@ def test_progress_is_told(training):
 
 @pytest.mark.parametrize("moment", [0.0, 0.5, 1.0])
 def test_progress_can_cancel(moment, training):
-    """Whenever: the exception comes through, and no thread goes on computing."""
+    """At any time: the exception is raised, and no thread goes on computing."""
 
     class CancelError(Exception):
         pass
@@ -705,7 +705,7 @@ def test_progress_can_cancel(moment, training):
 
 
 def test_cancelling_takes_effect_soon(training):
-    """Also while the next part's rays are cast beside: many times faster than to the end."""
+    """Cancelling also stops the thread that casts the rays of the next part."""
 
     class CancelError(Exception):
         pass

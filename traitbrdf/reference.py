@@ -1,19 +1,19 @@
-"""The oracle: brute-force integration of the reflection equation in float64.
+"""The reference: brute-force integration of the reflection equation in float64.
 
-I(x, wo) = integral of L(wi) V(x, wi) rho(wi, wo) max(0, wi.n) d omega over the texels of the map
-(piecewise constant) plus the lights beside it. Slow and simple on purpose: every texel above the
-horizon is visited, texels are cut until they are small against their distance from the mirror peak
-and from the horizon, and the whole mesh is refined until two successive answers agree. It shares no
-quadrature with `traitbrdf.transport`.
+I(x, wo) = integral of L(wi) V(x, wi) rho(wi, wo) max(0, wi.n) d omega over the texels of the map,
+in which radiance is constant, plus the lights beside it. The method is slow and simple on purpose.
+Every texel above the horizon is visited. Texels are cut until they are small compared with their
+distance from the mirror peak and from the horizon, and the whole mesh is refined until two
+successive results agree. It shares no quadrature with `traitbrdf.transport`.
 
-Shadows are defined so that there is one truth to converge to. Each texel is divided into n x n
-pieces equal in both angles, with the least n for which none is taller than `SHADOW_CELL`; a piece
-is wholly visible or wholly hidden, as the one ray towards the centroid of its solid angle says. At
-one point the visible light is then again piecewise constant, and the stated errors concern its
-integral. What the pieces themselves are off by is not in them: the edge of a shadow passes through
-them, so the penumbra of a light k pieces wide has about k steps where that edge runs along their
-sides, and many more where it runs across. The mirror's delta term sends one ray in its own
-direction, a point or directional light one to the light.
+Shadows are defined so that there is one result to converge to. Each texel is divided into n x n
+pieces equal in both angles, with the least n for which none is taller than `SHADOW_CELL`. A piece
+is visible or hidden as a whole, which one ray towards the centroid of its solid angle decides. So
+the visible light at one point is again piecewise constant, and the stated errors are those of its
+integral. They do not include the error of the pieces themselves: the edge of a shadow passes
+through them. The penumbra of a light k pieces wide has about k steps where that edge is parallel to
+their sides, and many more where it is not. The mirror's delta term sends one ray in its own
+direction; a point or directional light sends one ray to the light.
 """
 
 from __future__ import annotations
@@ -34,22 +34,40 @@ from traitbrdf.scene.scene import Scene
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
 Visible: TypeAlias = Callable[[Index, Float64], NDArray[np.bool_]]
-"""Whether light from infinity reaches points (m,) from world directions (m, 3): (m,) booleans."""
+"""Tells whether light from infinity reaches points (m,) from world directions (m, 3): (m,) bool."""
 Arriving: TypeAlias = tuple[Float64, Float64]
-"""World directions to a light and irradiance across them, (n, 3) each, as the n points get them."""
+"""Light at n points: world directions to it, and irradiance perpendicular to them, (n, 3) each."""
 
 SHADOW_CELL = 0.0125
 """Greatest height in radians of a piece of the map that is visible or hidden as a whole."""
 
-_COARSEST = 0.2
-_MAX_CELLS = 1_000_000
-_CHUNK = 1 << 17
-_BLOCK = 256  # samples whose results are kept at a time
+MAX_CELLS = 1_000_000
+"""Most cells of one mesh; a point that needs more is refused."""
+
+_COARSEST = 0.2  # resolution of the first mesh; see `integrate`
+_CHUNK = 1 << 17  # directions that are evaluated at a time
+_BLOCK = 256  # samples that are integrated at a time
 _GAUSS = 0.5 / math.sqrt(3.0)  # the two Gauss-Legendre points, from the middle, in widths
 
 
+class Shadows(NamedTuple):
+    """What the map's light meets on its way to surface points.
+
+    Attributes
+    ----------
+    visible : ``visible(point (m,), directions (m, 3)) -> (m,) bool``
+        Whether light from infinity reaches points, given by their index, from world directions.
+    cell : radians
+        Greatest height of a piece of the map that is visible or hidden as a whole; see the head of
+        this module.
+    """
+
+    visible: Visible
+    cell: float = SHADOW_CELL
+
+
 class IntegrationError(RuntimeError):
-    """The asked tolerance was not reached; the message says where and how far off."""
+    """The tolerance was not reached; the message names the point and the limit."""
 
 
 def radiance(
@@ -60,45 +78,45 @@ def radiance(
     lights: Sequence[Light | Arriving] = (),
     positions: Float64 | None = None,
     tolerance: float = 1e-4,
-    visible: Visible | None = None,
-    shadow_cell: float = SHADOW_CELL,
+    shadows: Shadows | None = None,
 ) -> tuple[Float64, Float64]:
-    """Radiance that leaves surface points towards the viewer.
+    """Compute the radiance that leaves surface points towards the viewer.
 
     Parameters
     ----------
-    normals, views : (n, 3) world unit vectors, views towards the viewer and above the surface
-    brdfs : B reflectances; each point is computed for all of them
-    environment : the map that shines
-    lights : what shines beside it
-        Lights, which meet no shadow, or pairs (directions, irradiance) of light as it arrives.
-    positions : (n, 3) world positions, needed for point lights
-    tolerance : relative to the pixel's largest channel
-    visible : callable or None
-        ``visible(point (m,), directions (m, 3)) -> (m,)`` tells what the map's light meets on its
-        way to points given by their index; None lets all of it pass.
-    shadow_cell : radians
-        Greatest height of the pieces of the map that are visible or hidden as a whole (see the
-        head of this module).
+    normals, views : (n, 3) float64
+        World unit vectors; views point towards the viewer and lie above the surface.
+    brdfs : B reflectances
+        Each point is computed for all of them.
+    environment : EnvironmentMap or None
+    lights : lights beside the map
+        Lights without shadows, or pairs (directions, irradiance) of light as it arrives.
+    positions : (n, 3) float64 or None
+        World positions; point lights need them.
+    tolerance : float
+        Greatest estimated error, relative to the largest channel of the point.
+    shadows : Shadows or None
+        What the map's light meets on its way to the points; None lets all of it pass.
 
     Returns
     -------
     radiance, error : (n, B, 3)
-        The radiance and the estimate of its own absolute error, one for the three channels: what
-        the last refinement changed, but at least 0.3 times the tolerance. An estimate and no bound:
-        it held the true error in 99.7 % of 3,000 random cases at tolerances of 1e-2 to 1e-4. All
-        that it missed by more than a factor of 3 were radiances below 1e-26, far out in the tail
-        of a sharp lobe.
+        The radiance, and an estimate of its absolute error that is the same for the three channels:
+        the change by the last refinement, but at least 0.3 times the tolerance. It is no bound. It
+        contained the true error in 99.7 % of 3,000 random cases at tolerances of 1e-2 to 1e-4. The
+        only cases that it missed by more than a factor of 3 were radiances below 1e-26, far out in
+        the tail of a sharp lobe.
 
     Raises
     ------
     IntegrationError
         If the estimate stays above the tolerance.
     ValueError
-        If point lights come without positions, or `shadow_cell` is not above 0.
+        If point lights come without positions, or the shadows' cell is not above 0.
     """
-    if not shadow_cell > 0.0:
-        raise ValueError(f"shadow_cell: expected an angle above 0 radians, got {shadow_cell!r}")
+    if shadows is not None:
+        _check_cell(shadows.cell)
+    visible = None if shadows is None else shadows.visible
     count = len(normals)
     if positions is None:
         if any(isinstance(light, PointLight) for light in lights):
@@ -106,11 +124,11 @@ def radiance(
         positions = np.zeros((count, 3))
     result = np.zeros((count, len(brdfs), 3))
     error = np.zeros_like(result)
-    evaluate = _Evaluator(brdfs)
+    evaluate = Evaluator(brdfs)
     if environment is not None:
         result += _mirrored(normals, views, brdfs, environment, visible)
-        texels = _Cells.texels(environment.image)
-        pieces = None if visible is None else _Pieces(environment, shadow_cell)
+        texels = Cells.texels(environment.image)
+        pieces = None if shadows is None else Pieces(environment, shadows.cell)
         for p in range(count):
             cells = texels
             if pieces is not None and visible is not None:
@@ -134,31 +152,38 @@ def fragments(
     tolerance: float = 1e-4,
     shadow_cell: float = SHADOW_CELL,
 ) -> tuple[Float64, Float64]:
-    """What fragments of a scene add to their pixels, in all its light and shadows.
+    """Compute what fragments of a scene add to their pixels, under all its light and shadows.
 
-    The sum over a fragment's samples of their share of the pixel times their radiance: a fragment
-    that covers a tenth of its pixel adds a tenth of its radiance.
+    The result is the sum over a fragment's samples of their radiance times their share of the
+    pixel: a fragment that covers a tenth of its pixel adds a tenth of its radiance.
 
     Parameters
     ----------
+    scene : Scene
     index : (m,) array_like of int
-        Which fragments of the scene.
-    brdfs : B reflectances; each fragment is computed for all of them
-    tolerance : of each sample, relative to its largest channel
-    shadow_cell : radians, as for `radiance`
+        Fragments of the scene.
+    brdfs : B reflectances
+        Each fragment is computed for all of them.
+    tolerance : float
+        Greatest estimated error of each sample, relative to its largest channel.
+    shadow_cell : float
+        In radians; see `Shadows`.
 
     Returns
     -------
     radiance, error : (m, B, 3)
-        As `radiance` gives them; the errors of a fragment's samples add up.
+        As `radiance` returns them; the errors of a fragment's samples add up.
 
     Raises
     ------
     IntegrationError
-        As `radiance` does; the points in its message are those of one block of samples.
+        As `radiance` does; its message counts points within one block of samples.
     IndexError
         If there is no such fragment.
+    ValueError
+        If `shadow_cell` is not above 0.
     """
+    _check_cell(shadow_cell)
     chosen = np.asarray(index, np.int64)
     sample, owner, share = scene.samples(chosen)
     result = np.zeros((len(chosen), len(brdfs), 3))
@@ -180,8 +205,7 @@ def fragments(
                 scene.environment,
                 [scene.arriving(light, here) for light in scene.lights],
                 tolerance=tolerance,
-                visible=visible if needs_rays else None,
-                shadow_cell=shadow_cell,
+                shadows=Shadows(visible, shadow_cell) if needs_rays else None,
             )
             weight = share[some, None, None]
             np.add.at(result, owner[some], weight * values)
@@ -195,12 +219,14 @@ def render(
     tolerance: float = 1e-4,
     progress: Callable[[str, float], None] | None = None,
 ) -> Float64:
-    """The whole frame (H, W, 3), linear radiance, backdrop included.
+    """Render the whole frame (H, W, 3) float64: linear radiance, backdrop included.
 
     Parameters
     ----------
+    scene : Scene
     brdfs : one reflectance for all parts, or one for each part by name
-    tolerance : of each sample, relative to its largest channel
+    tolerance : float
+        Greatest estimated error of each sample, relative to its largest channel.
     progress : called with ("reference", fraction done); may raise to cancel
 
     Raises
@@ -208,7 +234,7 @@ def render(
     IntegrationError
         As `radiance` does.
     ValueError
-        If a part that is seen has no reflectance.
+        If a visible part has no reflectance.
     """
     if isinstance(brdfs, Mapping):
         seen = [scene.parts[i] for i in np.unique(scene.pixel_part)]
@@ -232,7 +258,13 @@ def render(
 
 
 def relative_error(image: ArrayLike, reference: ArrayLike) -> float:
-    """Mean relative L1: mean|I - I_ref| / mean(I_ref), linear radiance of the same shape."""
+    """Return the mean relative L1 of linear radiance: mean|I - I_ref| / mean(I_ref).
+
+    Raises
+    ------
+    ValueError
+        If the two shapes differ.
+    """
     shown, true = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     if shown.shape != true.shape:
         raise ValueError(f"image: expected the reference's shape {true.shape}, got {shown.shape}")
@@ -242,7 +274,10 @@ def relative_error(image: ArrayLike, reference: ArrayLike) -> float:
 
 
 def tone_mapped_psnr(image: ArrayLike, reference: ArrayLike) -> float:
-    """PSNR in dB of the tone-mapped pictures (..., 3), exposed for the reference; at most 99."""
+    """Return the PSNR in dB, at most 99, of tone-mapped pictures (..., 3).
+
+    Both are linear radiance, and are shown at the exposure of the reference.
+    """
     exposure = exposure_of(reference)
     shown = tone_map(image, exposure).astype(np.float64)
     true = tone_map(reference, exposure).astype(np.float64)
@@ -250,11 +285,15 @@ def tone_mapped_psnr(image: ArrayLike, reference: ArrayLike) -> float:
     return min(99.0, 10.0 * math.log10(255.0**2 / squared)) if squared > 0.0 else 99.0
 
 
-class _Evaluator:
-    """Sums f(wi, wo) * weight over directions, for all BRDFs at once.
+class Evaluator:
+    """Sums of f(wi, wo) * weight over directions, for all BRDFs at once.
 
-    Tables on one grid share the look-up: radiance is linear in the table, so the weights are first
-    gathered on the cells.
+    Radiance is linear in a table, so the weights are first summed in the cells: all tables on one
+    grid share this look-up.
+
+    Parameters
+    ----------
+    brdfs : B reflectances
     """
 
     def __init__(self, brdfs: Sequence[Reflectance]) -> None:
@@ -272,7 +311,7 @@ class _Evaluator:
             self.tables[grid] = members, np.stack(values).astype(np.float64)
 
     def __call__(self, wi: Float64, wo: Float64, weight: Float64) -> Float64:
-        """(B, 3) sums for local wi (m, 3), one wo (3,), and weight (m, 3) per colour."""
+        """Return sums (B, 3) for local wi (m, 3), one wo (3,), and weights (m, 3) by colour."""
         result = np.zeros((self.count, 3))
         lit = (wi[:, 2] > 0.0) & (weight.max(-1) > 0.0)
         if wo[2] <= 0.0 or not lit.any():
@@ -294,10 +333,14 @@ class _Evaluator:
         return result
 
 
-class _Cells(NamedTuple):
-    """Lat-long rectangles of constant light: radiance (k, 3), and their edges (k,) in radians.
+class Cells(NamedTuple):
+    """Lat-long rectangles of constant radiance.
 
-    `top` and `bottom` are polar angles from +y, `left` and `right` azimuths 2 pi u of the map.
+    Attributes
+    ----------
+    light : (k, 3) radiance
+    top, bottom : (k,) polar angles from +y in radians
+    left, right : (k,) azimuths 2 pi u of the map in radians
     """
 
     light: Float64
@@ -307,8 +350,8 @@ class _Cells(NamedTuple):
     right: Float64
 
     @classmethod
-    def texels(cls, image: NDArray[np.float32]) -> _Cells:
-        """The texels of a map (M, N, 3) that shine, in row-major order."""
+    def texels(cls, image: NDArray[np.float32]) -> Cells:
+        """Return the texels of a map (M, N, 3) that are not black, in row-major order."""
         rows, columns, _ = image.shape
         row, column = np.nonzero(image.max(axis=-1) > 0.0)
         down, across = math.pi / rows, 2.0 * math.pi / columns
@@ -320,13 +363,20 @@ class _Cells(NamedTuple):
             (column + 1) * across,
         )
 
-    def take(self, which: NDArray[np.generic]) -> _Cells:
-        """The rectangles of an index or a mask."""
-        return _Cells(*(array[which] for array in self))
+    def take(self, which: NDArray[np.generic]) -> Cells:
+        """Return the rectangles of an index or a mask."""
+        return Cells(*(array[which] for array in self))
 
 
-class _Pieces:
-    """The map cut into what is visible or hidden as a whole."""
+class Pieces:
+    """The map cut into pieces that are visible or hidden as a whole.
+
+    Parameters
+    ----------
+    environment : EnvironmentMap
+    shadow_cell : float
+        Greatest height of a piece, in radians.
+    """
 
     def __init__(self, environment: EnvironmentMap, shadow_cell: float) -> None:
         image = environment.image
@@ -334,9 +384,9 @@ class _Pieces:
         n = math.ceil(math.pi / rows / shadow_cell)
         fine = EnvironmentMap(image.repeat(n, axis=0).repeat(n, axis=1))
         shining = fine.image.max(axis=-1) > 0.0
-        self.texels = _Cells.texels(image)
-        self.cells = _Cells.texels(fine.image)
-        # the texel that each piece is cut from, counted as in `texels`
+        self.texels = Cells.texels(image)
+        self.cells = Cells.texels(fine.image)
+        # the texel that each piece is cut from, an index into `texels`
         number = np.cumsum(image.max(axis=-1) > 0.0).reshape(rows, columns) - 1
         row, column = np.nonzero(shining)
         self.texel = number[row // n, column // n]
@@ -346,10 +396,17 @@ class _Pieces:
         # no point of a piece is further from its centroid than this
         self.reach = np.hypot(math.pi / (rows * n), 2.0 * math.pi / (columns * n))
 
-    def seen(self, point: int, normal: Float64, visible: Visible) -> _Cells:
-        """The light that reaches a point with a world normal (3,).
+    def seen(self, point: int, normal: Float64, visible: Visible) -> Cells:
+        """Return the light that reaches a point.
 
-        Texels that are not cut by a shadow stay whole: the integral is the same and sooner done.
+        Texels that no shadow cuts stay whole, which is faster and gives the same integral.
+
+        Parameters
+        ----------
+        point : int
+            Index of the point, for `visible`.
+        normal : (3,) unit world vector
+        visible : as for `Shadows`
         """
         above = np.flatnonzero(self.toward @ normal > -self.reach)
         clear = np.zeros(len(above), bool)
@@ -361,7 +418,7 @@ class _Pieces:
         shaded = np.bincount(self.texel[above[~clear]], minlength=count) > 0
         whole = self.texels.take(lit & ~shaded)
         cut = self.cells.take(above[clear & (lit & shaded)[self.texel[above]]])
-        return _Cells(*(np.concatenate(pair) for pair in zip(whole, cut, strict=True)))
+        return Cells(*(np.concatenate(pair) for pair in zip(whole, cut, strict=True)))
 
 
 def _mirrored(
@@ -371,7 +428,7 @@ def _mirrored(
     environment: EnvironmentMap,
     visible: Visible | None,
 ) -> Float64:
-    """What the mirrors (delta terms) of B reflectances show of the map, (n, B, 3)."""
+    """Compute the radiance (n, B, 3) of the map in the mirrors (delta terms) of B reflectances."""
     weight = np.stack([brdf.mirror for brdf in brdfs]) if brdfs else np.zeros((0, 3))
     if not weight.any():
         return np.zeros((len(normals), *weight.shape))
@@ -383,44 +440,55 @@ def _mirrored(
 
 
 def _converge(
-    cells: _Cells,
+    cells: Cells,
     n: Float64,
     v: Float64,
-    evaluate: _Evaluator,
+    evaluate: Evaluator,
     tolerance: float,
     point: int,
 ) -> tuple[Float64, Float64]:
+    """Refine the mesh until two successive integrals agree; return the last, and its error."""
     resolution = _COARSEST
-    previous = _integrate(cells, n, v, evaluate, resolution)
+    previous = integrate(cells, n, v, evaluate, resolution)
     while True:
         resolution *= 0.5
-        current = _integrate(cells, n, v, evaluate, resolution)
+        current = integrate(cells, n, v, evaluate, resolution)
         if current is None or previous is None:
-            raise IntegrationError(f"point {point}: more than {_MAX_CELLS} cells needed")
+            raise IntegrationError(f"point {point}: more than {MAX_CELLS} cells needed")
         error = np.abs(current - previous).max(axis=-1, keepdims=True)
         scale = tolerance * current.max(axis=-1, keepdims=True)
         if np.all(error <= scale):
-            # two meshes may agree by chance: no claim to be much better than asked
+            # two meshes may agree by chance, so the stated error is not far below the tolerance
             return current, np.broadcast_to(np.maximum(error, 0.3 * scale), current.shape)
         previous = current
 
 
-def _integrate(
-    cells: _Cells,
+def integrate(
+    cells: Cells,
     n: Float64,
     v: Float64,
-    evaluate: _Evaluator,
+    evaluate: Evaluator,
     resolution: float,
 ) -> Float64 | None:
-    """The integral with cells no larger than `resolution` times their distance from the peak.
+    """Integrate the light of cells on one mesh.
 
-    `n` and `v` are in the map's frame. None if it takes too many cells.
+    Parameters
+    ----------
+    cells : Cells
+    n, v : (3,) unit normal, and unit direction to the viewer, in the map's frame
+    evaluate : Evaluator of B reflectances
+    resolution : float
+        Greatest size of a cell relative to its distance from the mirror peak and the horizon.
+
+    Returns
+    -------
+    (B, 3) radiance, or None if more than `MAX_CELLS` cells are needed
     """
     wo = np.asarray(to_local(v, n), np.float64)
     light, top, bottom, left, right = cells
     samples: list[tuple[Float64, Float64]] = []
     used = 0
-    whole = -1.0  # the irradiance, texels at the horizon overrated: what cells are measured against
+    whole = -1.0  # irradiance that fluxes are compared with; overrates texels at the horizon
     while len(top):
         polar, azimuth = 0.5 * (top + bottom), 0.5 * (left + right)
         w = _direction(polar, azimuth)
@@ -439,7 +507,7 @@ def _integrate(
         cross = np.cross(h, n)
         theta_h = np.arctan2(np.sqrt(np.sum(cross * cross, axis=-1)), h @ n)
         reach = size / np.maximum(length, 0.02)  # |dh| <= |dw| / (2 cos theta_d), |wi+wo| = 2 cos
-        # against the distance from the peak, and from where both directions graze the surface
+        # relative to the distance from the peak, and from where both directions graze the surface
         coarse = reach / (np.maximum(theta_h - reach, 0.0) + 1e-4)
         coarse = np.maximum(coarse, size / (np.maximum(cos_i - size, 0.0) + wo[2] + 1e-4))
         at_horizon = np.abs(cos_i) < size
@@ -448,10 +516,10 @@ def _integrate(
         flux = light.sum(axis=-1) * omega
         if whole < 0.0:
             whole = float(np.sum(flux * np.maximum(cos_i, size)))
-        # a small bright light deserves more than one sample
+        # a small bright light needs more than one sample
         cut |= flux * np.maximum(cos_i, 0.0) > 0.25 * resolution**2 * whole
         small = ~cut & ~at_horizon & (coarse < 0.1 * resolution)
-        # over a cell the cosine averages to less than at its middle, by its second derivative
+        # second order: the mean cosine over a cell is less than that at its middle
         weight = omega * cos_i * (1.0 - size * size / 6.0)
         samples.append((w[small], light[small] * weight[small, None]))
         large = ~cut & ~small
@@ -463,7 +531,7 @@ def _integrate(
                 weight = (0.5 * share * omega)[large] * np.maximum(point @ n, 0.0)
                 samples.append((point, light[large] * weight[:, None]))
         used += len(top)
-        if used > _MAX_CELLS:
+        if used > MAX_CELLS:
             return None
         light = np.tile(light[cut], (4, 1))
         top, bottom, left, right = top[cut], bottom[cut], left[cut], right[cut]
@@ -485,7 +553,13 @@ def _integrate(
     return total
 
 
+def _check_cell(angle: float) -> None:
+    """Raise ValueError unless the greatest height of a piece is an angle above 0."""
+    if not angle > 0.0:
+        raise ValueError(f"shadow_cell: expected an angle above 0 radians, got {angle!r}")
+
+
 def _direction(polar: Float64, azimuth: Float64) -> Float64:
-    """Map directions (m, 3) at polar angles from +y and azimuths 2 pi u."""
+    """Return the map's directions (m, 3) at polar angles from +y and azimuths 2 pi u."""
     s = np.sin(polar)
     return np.stack([-s * np.sin(azimuth), np.cos(polar), s * np.cos(azimuth)], axis=-1)

@@ -433,7 +433,8 @@ def _transport(
     training = training_of(library, seed)
     report("tables", 0.0)
     if known is None:
-        transport = Transport(scene, grid, training, rank, resolution, seed, device, report, tables)
+        training = replace(training, fixed=tables)
+        transport = Transport(scene, grid, training, rank, resolution, seed, device, report)
     else:
         transport = known.freed(training, seed, report)
     if cache is not None and key is not None:

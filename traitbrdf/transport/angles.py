@@ -19,16 +19,18 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AnglesSeen:
-    """Which angles of a BRDF a scene can show at all: what lighting and view leave out, no edit
-    changes and no picture tells.
+    """The angles of a BRDF that a scene can show.
+
+    Where light and view leave out some angles, edits of the BRDF at these do not change the image.
 
     Attributes
     ----------
-    grid : of the tables
-    share : (n_theta_h, n_theta_d)
-        Share of the light that a white diffuse surface sends to the image, by the angles by which
-        it is reflected; sums to 1, all phi_d together. 0 where nothing is seen.
-    fragments : how many it was measured on
+    grid : HalfDiffGrid of the tables
+    share : (n_theta_h, n_theta_d) float64
+        Share of the light that a white diffuse surface reflects to the image at these angles, all
+        phi_d together. The sum is 1.
+    fragments : int
+        Number of fragments that were measured.
     """
 
     grid: HalfDiffGrid
@@ -37,18 +39,24 @@ class AnglesSeen:
 
     @property
     def density(self) -> Float64:
-        """(n_theta_h, n_theta_d) the share by square degree, over that of the densest place."""
+        """Share by square degree (n_theta_h, n_theta_d), relative to its maximum."""
         h, d = np.degrees(self.grid.theta_h), np.degrees(self.grid.theta_d)
         found: Float64 = self.share / (np.gradient(h)[:, None] * np.gradient(d)[None, :])
         return found / max(float(found.max()), 1e-300)
 
     @property
     def cells(self) -> float:
-        """The share of pairs of theta_h and theta_d that show: whose density is above 1e-4."""
+        """Share of the pairs of theta_h and theta_d whose density is above 1e-4."""
         return float(np.mean(self.density > 1e-4))
 
     def within(self, share: float = 0.9) -> tuple[float, float]:
-        """theta_h and theta_d in degrees below which a share of the light is reflected."""
+        """Return theta_h and theta_d in degrees below which a share of the light is reflected.
+
+        Raises
+        ------
+        ValueError
+            If the share is not from 0 to 1.
+        """
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"share: expected 0 to 1, got {share!r}")
         found = []
@@ -59,6 +67,7 @@ class AnglesSeen:
         return found[0], found[1]
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the measures as plain values, for a report."""
         half, most = self.within(0.5), self.within(0.9)
         return {
             "cells_seen": self.cells,
@@ -71,13 +80,25 @@ class AnglesSeen:
 def angles_seen(
     scene: Scene, grid: HalfDiffGrid, part: int | None = None, count: int = 384, seed: int = 0
 ) -> AnglesSeen:
-    """Which angles of the BRDF of a part (None: of the shape) a scene shows, from exact rows of
-    some fragments; no preparation is needed.
+    """Measure the angles of a BRDF that a scene shows, from exact rows of some fragments.
+
+    The scene need not be prepared.
+
+    Parameters
+    ----------
+    scene : Scene
+    grid : HalfDiffGrid of the tables
+    part : int or None
+        Index into ``scene.parts``; None for all parts of the shape.
+    count : int
+        Most fragments to measure.
+    seed : int
+        Chooses them.
 
     Raises
     ------
     ValueError
-        If nothing of it is in the picture.
+        If nothing of the part is in the picture.
     """
     parts = range(len(scene.shape.parts)) if part is None else [part]
     spans = [scene.part_slice(i) for i in parts]

@@ -1,4 +1,4 @@
-"""The few images that frames are made of, and the tables they are fitted to.
+"""The basis images that frames are combined from, and the tables that they are fitted to.
 
 For a fixed view and light, radiance is linear in the BRDF (Ben-Artzi, Overbeck & Ramamoorthi 2006,
 section 3), so all frames lie in the span of the images of a training set.
@@ -7,7 +7,8 @@ section 3), so all frames lie in the span of the images of a training set.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -33,53 +34,73 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 _PIECE = 4096
-"""Fragments whose rows of a basis are widened at a time."""
+"""Fragments whose basis images are converted to float32 at a time."""
 
 TOP = {torch.float32: 1.0, torch.bfloat16: 1.0, torch.float16: 2.0**14}
-"""The types a basis is kept in, and the largest number that its columns are scaled to."""
+"""The types that basis images are kept in, and the largest value that each column is scaled to."""
 
 
 @dataclass
 class Basis:
-    """The compressed operator of a group of parts; C is 3, or 1 where all light is grey."""
+    """The compressed operator of a group of parts: W is about Q C.
+
+    Attributes
+    ----------
+    parts : range
+        Indices into ``scene.parts``.
+    basis : (P, r) tensor of a type in `TOP`
+        Q: r basis images, shared by all colours.
+    damping : (P,) tensor
+        Weight of each fragment in the fit.
+    cells : (n,) tensor
+        Cells of the grid that the group sees.
+    rows : (C, r + m, n) tensor
+        The projection C of each colour, and the exact rows of m probes below it. The number of
+        colours is 3, or 1 where all light is grey.
+    place : (n,) tensor or None
+        Where the cells are among those of the scene; None if they are all of these.
+    """
 
     parts: range
-    basis: torch.Tensor  # Q (P, r), of all colours; of whatever type it is kept in
-    damping: torch.Tensor  # (P,) what the fit of a fragment was weighted with
-    cells: torch.Tensor  # (n,) the cells of the grid that the group sees
-    rows: torch.Tensor  # (C, r + m, n): the projection, and the probes' exact rows below it
-    place: torch.Tensor | None = None  # (n,) where the cells are among the scene's; None: all
+    basis: torch.Tensor
+    damping: torch.Tensor
+    cells: torch.Tensor
+    rows: torch.Tensor
+    place: torch.Tensor | None = None
 
     @property
     def rank(self) -> int:
+        """Number of basis images."""
         return self.basis.shape[-1]
 
     @property
     def projection(self) -> torch.Tensor:
-        """(C, r, n) a table's coefficients."""
+        """Matrices (C, r, n) that take a table to its coefficients."""
         return self.rows[:, : self.rank]
 
     @property
     def probes(self) -> torch.Tensor:
-        """(C, m, n) exact rows of the probes."""
+        """Exact rows (C, m, n) of the probes."""
         return self.rows[:, self.rank :]
 
     def at_cells(self, table: torch.Tensor) -> torch.Tensor:
-        """(3, n) of a table (len(Transport.cells), 3)."""
+        """Return the values (3, n) of a table (len(Transport.cells), 3) at the group's cells."""
         return (table if self.place is None else table[self.place]).T.contiguous()
 
     def images(self, fragments: slice, coefficients: torch.Tensor) -> torch.Tensor:
-        """(P, 3) float32: Q of some of its fragments times coefficients (3, r)."""
+        """Return Q at some of its fragments times coefficients (3, r): (P, 3) float32."""
         chosen = self.basis[fragments]
         if chosen.dtype == torch.float32:
             return chosen @ coefficients.T
-        # sums of half precision would lose what cancels; a piece at a time, as caches hold it
+        # sums in half precision would lose what cancels; a piece at a time fits the cache
         pieces = torch.split(chosen, _PIECE)
         return torch.cat([piece.float() @ coefficients.T for piece in pieces])
 
     def stored(self, dtype: torch.dtype) -> Basis:
-        """The same with Q in another type, each column scaled to fill its range; the scales go
-        into the projection."""
+        """Return the same basis with Q in another type.
+
+        Each column is scaled to fill the range of the type; the projection takes up the scales.
+        """
         basis = self.basis.float()
         if dtype == torch.float32:
             return replace(self, basis=basis)
@@ -92,24 +113,36 @@ class Basis:
 
 @dataclass(frozen=True)
 class Training:
-    """Scalar tables (cells, T) float32 that a basis is fitted to, and what each counts (T,)."""
+    """What the bases of a transport are fitted to.
+
+    Attributes
+    ----------
+    tables : (cells, T) float32 scalar tables, in 1/sr
+    weight : (T,) float64, how much each table counts
+    fixed : tables (cells, 3) float32 by index into ``scene.parts``
+        Parts that keep their material. A group of nothing else is prepared for these tables alone,
+        which takes a fraction of the time; `Transport.freed` prepares it for all others.
+    """
 
     tables: Float32
     weight: Float64
+    fixed: Mapping[int, Float32] = field(default_factory=dict)
 
 
 def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Training:
-    """What a frame has to be able to show.
+    """Collect the tables that frames have to be able to show.
 
-    The library's channels; every model family at log-spaced parameters; and copies of both under
-    smooth random fields in log f ("curve moves"), which count a tenth: measured materials are
-    no library members, and these keep their error from growing tenfold.
+    They are the library's channels; every model family at log-spaced parameters; and copies of both
+    with smooth random fields added to log f, which count a tenth. Measured materials are not
+    members of the library: without the copies their error would be ten times as large.
 
     Parameters
     ----------
-    library : (grid.size, n) float32, channels of library members
+    library : (grid.size, n) float32
+        Channels of the library's members, in 1/sr.
     grid : HalfDiffGrid
-    seed : draws the fields
+    seed : int
+        Draws the fields.
     """
     families: list[Model] = [Lambert(0.5)]
     families += [OrenNayar(0.5, sigma) for sigma in (0.3, 0.9)]
@@ -133,12 +166,12 @@ def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Trai
     fields = _smooth_fields(grid, len(chosen), rng)
     varied = plain[:, chosen] * np.exp(fields)
     weight = np.concatenate([np.ones(plain.shape[1]), np.full(len(chosen), 0.1)])
-    weight[library.shape[1]] = 30.0  # Lambert, the first of the families, lies in every basis
+    weight[library.shape[1]] = 30.0  # every basis must show Lambert, the first of the families
     return Training(np.concatenate([plain, varied], axis=1), weight)
 
 
 def _smooth_fields(grid: HalfDiffGrid, count: int, rng: np.random.Generator) -> Float32:
-    """(cells, count) random sums of low cosines over the table, of amplitude about 1."""
+    """Draw fields (cells, count) over the table: sums of low cosines, of amplitude about 1."""
     u = np.sqrt(grid.theta_h / (math.pi / 2))
     v = grid.theta_d / (math.pi / 2)
     waves = [
@@ -152,53 +185,49 @@ def _smooth_fields(grid: HalfDiffGrid, count: int, rng: np.random.Generator) -> 
 
 
 def per_colour(matrices: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """(C, a, b) times (3, b), colour by colour; one matrix (C = 1) serves all three."""
+    """Multiply matrices (C, a, b) with vectors (3, b) by colour; one (C = 1) serves all three."""
     if len(matrices) == 1:
         return (matrices[0] @ vectors.T).T
     # a batched product of matrices with vectors is four times slower
     return torch.stack([torch.mv(matrices[c], vectors[c]) for c in range(3)])
 
 
-def eigh(symmetric: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eigenvalues, ascending, and eigenvectors, on one thread.
-
-    Several threads would meet at thousands of barriers, and where other work shares the cores each
-    of them costs a time slice: seconds for what one thread does in milliseconds.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        values, vectors = torch.linalg.eigh(symmetric)
-    finally:
-        torch.set_num_threads(threads)
-    return values, vectors
-
-
 def damping_of(images: torch.Tensor) -> torch.Tensor:
-    """Factors (P,) for images (C, P, R), 1 but for pixels that stand far above the others.
+    """Return factors (P,) that damp pixels far brighter than the others; 1 elsewhere.
 
-    At grazing views, or where one pixel of thousands mirrors the sun, unbounded lobes make a
-    pixel's images exceed the others' a thousandfold. It would then fill the basis alone.
+    At grazing views, or where one pixel of thousands mirrors the sun, unbounded lobes can make a
+    pixel a thousand times brighter than all others. It alone would then determine the basis.
+
+    Parameters
+    ----------
+    images : (C, P, R) tensor
+        R images of P pixels in C colours.
     """
     size = (images**2).sum(dim=(0, 2)).sqrt()
     usual = size.mean()
-    for _ in range(8):  # the mean of what is left of them, whatever stands out
+    for _ in range(8):  # a mean that the brightest pixels hardly move
         usual = size.minimum(10.0 * usual).mean()
     return torch.where(size > 10.0 * usual, 10.0 * usual / size.clamp_min(1e-30), 1.0)
 
 
 def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
-    """The leading left singular vectors (P, r) of images (C, P, R), all columns together.
+    """Return the leading left singular vectors (P, r) of images, all columns together.
 
-    At most `rank` of them, and none whose singular value is less than `enough` of the largest.
+    Parameters
+    ----------
+    images : (C, P, R) tensor
+    rank : int
+        At most so many vectors.
+    enough : float
+        Vectors whose singular value is less than this share of the largest are left out.
     """
     count, size = images.shape[0] * images.shape[2], images.shape[1]
     gram = torch.zeros((count, count), dtype=torch.float64)
     pieces = [slice(start, start + 8192) for start in range(0, size, 8192)]
-    for piece in pieces:  # singular values over eight decades: single precision would lose four
+    for piece in pieces:  # singular values span eight decades: float32 would lose four of them
         columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
         gram += columns.T @ columns
-    squares, vectors = eigh(gram)
+    squares, vectors = torch.linalg.eigh(gram)
     squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
     kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
     turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
@@ -210,12 +239,12 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
 
 
 def extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
-    """An orthonormal basis (P, r) and what images (P, 3) add to it."""
+    """Return an orthonormal basis (P, r) with further columns, so that it spans images (P, 3)."""
     known, fresh = basis.double(), images.double()
     fresh = fresh / fresh.norm(dim=0).clamp_min(1e-30)
     for _ in range(2):  # the second pass removes what rounding left of the first
         fresh = fresh - known @ (known.T @ fresh)
-    squares, vectors = eigh(fresh.T @ fresh)
-    keep = squares > 1e-10  # grey light, or an image that is known already, adds fewer
+    squares, vectors = torch.linalg.eigh(fresh.T @ fresh)
+    keep = squares > 1e-10  # grey light, or an image within the span, adds fewer columns
     fresh = (fresh @ vectors[:, keep]) * squares[keep].rsqrt()
     return torch.cat([basis, fresh.float()], dim=1)

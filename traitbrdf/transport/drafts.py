@@ -1,4 +1,4 @@
-"""Drafts: frames at a small size before a view or a light is prepared."""
+"""Drafts: small frames that are shown before a view or a light is prepared."""
 
 from __future__ import annotations
 
@@ -18,21 +18,24 @@ Float64 = NDArray[np.float64]
 
 
 class Draft:
-    """A scene's frames at a small size, straight from the operator: for what is not prepared.
+    """Small frames of a scene, computed by the uncompressed operator without preparation.
 
     Parameters
     ----------
     scene : Scene at its full size
     grid : HalfDiffGrid of the tables
     size : int
-        Pixels along the longer side; the scene's own where that is smaller.
+        Pixels along the longer side, or the scene's own number if that is smaller.
     resolution : float
-        As for `Operator`: coarse light makes a first image in a fraction of a second.
-    tree : LightTree of the scene's map, if it is at hand
-    seed : chooses the probes
+        As for `Operator`; coarse light gives a first image in a fraction of a second.
+    tree : LightTree or None
+        The tree of the scene's map, if it was built before.
+    seed : int
+        Chooses the probes.
     """
 
     PROBES = 24
+    """Fragments that are computed exactly, to measure the error."""
 
     def __init__(
         self,
@@ -45,7 +48,7 @@ class Draft:
     ) -> None:
         scale = min(1.0, size / max(scene.height, scene.width))
         shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
-        # what is enlarged is blurred anyway
+        # one sample a pixel will do: the frame is enlarged, and so blurred, anyway
         self.scene = scene.changed(size=shape, subsamples=1) if scale < 1.0 else scene
         self.operator = Operator(self.scene, grid, resolution, tree)
         count = len(self.scene.pixels)
@@ -57,7 +60,19 @@ class Draft:
     def render(
         self, tables: Sequence[Float32], mirrors: Sequence[Float64] | None = None
     ) -> tuple[Float32, float]:
-        """The small frame (h, w, 3) for one table (grid.size, 3) a part, and its measured error."""
+        """Render the small frame.
+
+        Parameters
+        ----------
+        tables : (grid.size, 3) float32 of each part, f_r in 1/sr
+        mirrors : (3,) of each part, weights of a perfect mirror, or None
+
+        Returns
+        -------
+        frame : (h, w, 3) float32 linear radiance, backdrop included
+        error : float
+            Mean relative L1 without mirrors, measured on the probes.
+        """
         scene = self.scene
         radiance = np.zeros((len(scene.pixels), 3), np.float32)
         exact = np.zeros((len(self._probes), 3))

@@ -1,24 +1,130 @@
-"""Compiled loops of the walk over the light."""
+"""Compiled loops that walk the light tree and sum its leaves.
+
+Torch cannot express these loops: they descend trees and sum lists of different lengths. Numba
+compiles them. Everything that runs while a user paints is torch, on any device.
+
+Named tuples group the arguments; `traitbrdf.transport.arrays` has those that callers make. A loop
+that numba runs in parallel may write only to arrays that are arguments of their own: numba removes
+an assignment to an array of a tuple as dead code.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+
+from traitbrdf.transport.arrays import (
+    QuadratureSettings,
+    Questions,
+    Tables,
+    TreeArrays,
+    VisibilityMasks,
+)
 
 f32 = np.float32
 _UNKNOWN, _LIT, _DOUBTFUL, _PARTLY = 0, 1, 2, 3
 
 
-# The loops below are what torch cannot express: tree descents, and sums over lists of uneven
-# length. Numba compiles them; everything that runs while a user paints is torch, on any device.
+class _Frame(NamedTuple):
+    """What the samples of one group share.
+
+    Attributes
+    ----------
+    normal, viewer : (3,) float32
+        Mean unit normal, and mean unit direction towards the viewer, in the map's frame.
+    mask : (4,) int32
+        Rows of the visibility masks; -1 ends the list.
+    spread : float32
+        Greatest angle in radians between the half vector of a sample and that of the means.
+    """
+
+    normal: Any
+    viewer: Any
+    mask: Any
+    spread: Any
+
+
+class _Pending(NamedTuple):
+    """Stacks of a walk: what it still has to visit.
+
+    Attributes
+    ----------
+    stack : (n,) int32
+        Nodes.
+    fates : (n,) int8
+        What is known about the visibility of each node.
+    cells : (n, 6) float32
+        Pieces of texels: bounds of polar angle and azimuth, relative to the middle of the leaf, in
+        radians; then row and column of the texel.
+    """
+
+    stack: Any
+    fates: Any
+    cells: Any
+
+
+class _Sample(NamedTuple):
+    """One sample: unit normal (3,), unit direction to the viewer (3,), share of the fragment."""
+
+    normal: Any
+    viewer: Any
+    share: Any
+
+
+class _Stencil(NamedTuple):
+    """Where leaves fall in a table.
+
+    Attributes
+    ----------
+    cell : (3, n) int32
+        Index of the lowest cell (theta_h and theta_d in one) of the nearer theta_h sample; how many
+        theta_h nodes further the other sample starts; lowest node of phi_d.
+    place : (7, n) float32
+        Fractions along theta_h (both samples), theta_d and phi_d, and the irradiance RGB.
+    """
+
+    cell: Any
+    place: Any
+
+
+class _Row(NamedTuple):
+    """A row of the operator while it is summed.
+
+    Attributes
+    ----------
+    values : (cells, 4) float32
+        RGB and padding.
+    touched : (2, pairs) int32
+        `touched[0]` lists the pairs of theta_h and theta_d that are not zero; `touched[1]` is 1 at
+        each of them.
+    """
+
+    values: Any
+    touched: Any
 
 
 @numba.njit(cache=True, nogil=True)
 def cut_ranges(child: Any, split: Any) -> Any:
-    """Ranges of cut nodes under every node, in the order of a descent, and the cut itself."""
+    """Find the cut through a tree, and the range of cut nodes under every node.
+
+    Parameters
+    ----------
+    child : (n, 2) int32
+        Children of each node, -1 where there is none.
+    split : (n,) bool
+        Whether the cut passes below a node.
+
+    Returns
+    -------
+    first, last : (n,) int32
+        The cut nodes under a node are `first` to `last - 1`. A node below the cut has the one cut
+        node above it.
+    cut : (D,) int64
+        Nodes of the cut, in the order of a depth-first descent.
+    """
     n = len(child)
     first = np.zeros(n, np.int32)
     last = np.zeros(n, np.int32)
@@ -32,7 +138,7 @@ def cut_ranges(child: Any, split: Any) -> Any:
     done = np.zeros(n, np.bool_)
     while top >= 0:
         i, below = stack[top], inside[top]
-        if done[i]:  # its children are through
+        if done[i]:  # all its children were visited
             last[i] = found
             top -= 1
             continue
@@ -56,7 +162,20 @@ def cut_ranges(child: Any, split: Any) -> Any:
 def inherit(
     bits: Any, normals: Any, toward: Any, known: Any, around: Any, least: Any, sharp: Any
 ) -> None:
-    """Bits that all rows around agree on, 2 below the horizon, 3 where a ray is needed."""
+    """Set the visibility bits on which all neighbouring rows agree.
+
+    Parameters
+    ----------
+    bits : (m, D) uint8
+        Set to 0 (hidden), 1 (visible), 2 (below the horizon) or 3 (a ray is needed).
+    normals : (m, 3) unit
+    toward : (D, 3) unit directions towards the light
+    known : (rows, D) uint8 bits that were found before
+    around : (m, 4) int32 neighbouring rows of `known`, -1 for none
+    least : int
+        With fewer rows around, every direction above the horizon needs a ray.
+    sharp : (D,) bool directions that need a ray in any case
+    """
     for p in numba.prange(len(bits)):
         have = 0
         for k in range(4):
@@ -85,7 +204,14 @@ def inherit(
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def pack_bits(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: Any) -> None:
-    """Sets of nodes that are hidden, not surely visible, not surely hidden."""
+    """Pack visibility bits into the three sets of `VisibilityMasks`.
+
+    Parameters
+    ----------
+    bits : (m, D) uint8, 0 hidden, 1 visible, 2 below the horizon
+    neighbours : (D, k) int32 nearest other directions
+    hidden, unseen, unhidden : (m, words) uint64, which are set
+    """
     for p in numba.prange(len(bits)):
         hidden[p] = 0
         unseen[p] = 0
@@ -110,7 +236,7 @@ def pack_bits(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: An
 
 @numba.njit(cache=True, inline="always")
 def _some(words: Any, row: Any, start: Any, stop: Any, wanted: Any) -> Any:
-    """Whether any of the bits start to stop - 1 of a row is `wanted`."""
+    """Return whether any of the bits `start` to `stop - 1` of a row equals `wanted`."""
     ones = np.uint64(0xFFFFFFFFFFFFFFFF)
     low, high = start >> 6, (stop - 1) >> 6
     found = False
@@ -126,8 +252,20 @@ def _some(words: Any, row: Any, start: Any, stop: Any, wanted: Any) -> Any:
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, share: Any) -> None:
-    """How unevenly the corners of a cell are lit: root of the summed squares of the shares of
-    irradiance that some see and others do not. Many small ones vary evenly; a large one jumps."""
+    """Measure how differently the corners of lattice cells are lit.
+
+    The measure is the root of the summed squares of the shares of irradiance that some corners see
+    and others do not. Many small shares change smoothly across a cell; one large share jumps.
+
+    Parameters
+    ----------
+    out : (m,) float32, which is set
+    bits : (rows, D) uint8, 0 hidden, 1 visible, 2 below the horizon
+    cells : (m, 4) int32 rows of the corners, -1 for none
+    normals : (m, 3) unit
+    toward : (D, 3) unit directions towards the light
+    share : (D,) share of all flux
+    """
     for p in numba.prange(len(cells)):
         total, unlike = 1e-30, 0.0
         for d in range(bits.shape[1]):
@@ -153,7 +291,16 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
-def interpolate_masks(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
+def interpolate_images(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
+    """Interpolate images between the fragments where they were computed.
+
+    Parameters
+    ----------
+    out : (P, 3, T) float32, which is set
+    coarse : (K, 3, T) float32 radiance of the computed fragments
+    corners : (P, 4) int32 indices into `coarse`
+    weights : (P, 4) float32
+    """
     for p in numba.prange(len(out)):
         for c in range(out.shape[1]):
             for j in range(out.shape[2]):
@@ -167,8 +314,11 @@ def interpolate_masks(out: Any, coarse: Any, corners: Any, weights: Any) -> None
 
 @numba.njit(cache=True, inline="always")
 def _push_texels(cells: Any, top: Any, box: Any, t_step: Any, f_step: Any) -> Any:
-    """Put the texels of a leaf on the stack `cells`, as offsets from its middle, each with the row
-    and the column it is of; returns the stack's new top."""
+    """Push the texels of a leaf on the stack `cells`, and return the new top.
+
+    Their bounds are relative to the middle of the leaf `box`; `t_step` and `f_step` are height and
+    width of a texel in radians.
+    """
     row, column = 0.5 * (box[0] + box[1]), 0.5 * (box[2] + box[3])
     for i in range(box[0], box[1]):
         for j in range(box[2], box[3]):
@@ -181,7 +331,7 @@ def _push_texels(cells: Any, top: Any, box: Any, t_step: Any, f_step: Any) -> An
 
 @numba.njit(cache=True, inline="always")
 def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> Any:
-    """Put the quarters of the piece above the stack `cells` on it; returns its new top."""
+    """Push the quarters of the piece just above the stack's top, and return the new top."""
     tm, fm = f32(0.5) * (t0 + t1), f32(0.5) * (f0 + f1)
     row, column = cells[top + 1, 4], cells[top + 1, 5]
     for a in range(4):
@@ -196,7 +346,7 @@ def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> 
 
 @numba.njit(cache=True, inline="always")
 def _turned(angle: Any, sine: Any, cosine: Any) -> Any:
-    """Sine and cosine after turning by a small angle (at most 0.4)."""
+    """Return sine and cosine of the sum of an angle and a small one (at most 0.4 radians)."""
     x = angle * angle
     s = angle * (f32(1.0) - x * (f32(1 / 6) - x * (f32(1 / 120) - x * f32(1 / 5040))))
     c = f32(1.0) - x * (f32(0.5) - x * (f32(1 / 24) - x * (f32(1 / 720) - x * f32(1 / 40320))))
@@ -205,7 +355,10 @@ def _turned(angle: Any, sine: Any, cosine: Any) -> Any:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) -> Any:
-    """Irradiance (summed over colours) to some percent: what bright nodes are measured against."""
+    """Estimate the irradiance, all colours together, to some percent.
+
+    The walk compares the flux of bright nodes with it.
+    """
     total = f32(0.0)
     top = 0
     stack[0] = 0
@@ -227,24 +380,41 @@ def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _walk(
-    leaves: Any, ask: Any, answers: Any, n: Any, v: Any, mask: Any,
-    place: Any, moment: Any, child: Any, box: Any, image: Any,
-    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    spread: Any, rule: Any, low: Any, high: Any, outline: Any, lobe: Any,
-    stack: Any, fates: Any, cells: Any,
+    leaves: Any, ask: Any, answers: Any, frame: _Frame, tree: TreeArrays, masks: VisibilityMasks,
+    wanted: Any, pending: _Pending,
 ) -> Any:  # fmt: skip
-    """Leaves of one group into `leaves` (13, n): direction, vector irradiance RGB, variance.
+    """Write the leaves of one group, and the shadow rays that it asks for.
 
-    Where a ray of its own decides on a leaf, or on all pieces of a texel, the direction is put
-    into `ask` and the light let through if `answers` says so (1).
+    A node is a leaf if all of the following hold for all half vectors up to `frame.spread` away
+    from that of `frame`. Its reach in half-vector space is at most `relative` times the sum of
+    `core` and its distance from the mirror peak (or `lobe`, if that is more). It carries at most
+    the share `brightest` of the irradiance, or its reach is accordingly smaller. Its radius is at
+    most `widest` and, if the horizon cuts it, at most `horizon`.
 
-    A node is a leaf where its reach in half-vector space is at most `relative` times its distance
-    from the mirror peak (or times `lobe`, where that is more) and `core`, it carries at most the
-    share `brightest` of the irradiance or is accordingly smaller, it is no wider than `widest`,
-    and, if the horizon cuts it, `horizon`. `low` and `high` bound sin(theta_h). All holds for half
-    vectors up to `spread` away from those of `n` and `v`. Returns the number of leaves, the
-    capacity if too many, and of questions.
+    Parameters
+    ----------
+    leaves : (13, capacity) float32
+        Set to direction, vector irradiance RGB, and variance of the direction.
+    ask : (most, 3) float32
+        Set to the directions of shadow rays: one decides on a leaf, or on all pieces of a texel.
+    answers : (most,) uint8, 1 where the ray is free
+    frame : _Frame
+    tree : TreeArrays
+    masks : VisibilityMasks
+    wanted : rule (5,) of the group, low, high, outline, lobe; see `QuadratureSettings`
+    pending : _Pending
+
+    Returns
+    -------
+    count : int, number of leaves; the capacity if there are too many
+    asked : int, number of shadow rays
     """
+    n, v, mask, spread = frame.normal, frame.viewer, frame.mask, frame.spread
+    place, moment, child, box, image = tree.place, tree.moment, tree.child, tree.box, tree.image
+    first, last = masks.first, masks.last
+    hidden, unseen, unhidden = masks.hidden, masks.unseen, masks.unhidden
+    rule, low, high, outline, lobe = wanted
+    stack, fates, cells = pending.stack, pending.fates, pending.cells
     relative, brightest, horizon, widest, core = rule[0], rule[1], rule[2], rule[3], rule[4]
     t_step, f_step = math.pi / image.shape[0], 2.0 * math.pi / image.shape[1]
     row_sin = row_cos = column_sin = column_cos = f32(0.0)
@@ -283,7 +453,7 @@ def _walk(
             cx, cy, cz = place[i, 0], place[i, 1], place[i, 2]
             r, variance = place[i, 3], place[i, 4]
         cos_i = n0 * cx + n1 * cy + n2 * cz
-        # the centroid may lie in a corner: everything is within 2 r of it
+        # the centroid may lie in a corner: the node reaches at most 2 r from it
         if cos_i < f32(-2.0) * r - spread:
             continue
         hx, hy, hz = cx + v0, cy + v1, cz + v2
@@ -295,7 +465,7 @@ def _walk(
         if nearest > high or sin_h + f32(2.0) * reach + spread < low:
             continue
         if not in_texel:
-            # shadows: what is known of a node holds for all below it
+            # what is known about a node's visibility holds for all nodes below it
             fate = fates[top + 1]
             if fate == _UNKNOWN:
                 d0, d1 = first[i], last[i]
@@ -370,7 +540,7 @@ def _walk(
                 column_sin, column_cos = f32(math.sin(f)), f32(math.cos(f))
                 piece = _push_texels(cells, piece, box[i], t_step, f_step)
                 if box[i, 1] - box[i, 0] == 1 and box[i, 3] - box[i, 2] == 1:
-                    # the texel as a whole has just been found too large
+                    # the leaf is this one texel, which was just found too large
                     t, f = f32(0.5 * t_step), f32(0.5 * f_step)
                     piece = _push_quarters(cells, piece - 1, -t, t, -f, f)
                 continue
@@ -407,7 +577,7 @@ def _walk(
 
 @numba.njit(cache=True, inline="always")
 def _arctan(y: Any, x: Any) -> Any:
-    """atan2 in the first quadrant, to 2e-6 of the angle (Abramowitz & Stegun 4.4.49)."""
+    """Return atan2 in the first quadrant, to 2e-6 of the angle (Abramowitz & Stegun 4.4.49)."""
     t = min(x, y) / max(max(x, y), f32(1e-30))
     s = t * t
     a = f32(-0.0040540580)
@@ -423,16 +593,14 @@ def _arctan(y: Any, x: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _stencils(
-    n: Any, v: Any, leaves: Any, count: Any,
-    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
-) -> None:  # fmt: skip
-    """First cells and interpolation weights of leaves: free of branches, so that it vectorises.
+def _stencils(sample: _Sample, leaves: Any, count: Any, tables: Tables, stencil: _Stencil) -> None:
+    """Set the cells and interpolation weights of the first `count` leaves of a sample.
 
-    cell (3, n): theta_h and theta_d of the lowest cell of the nearer theta_h sample as one index,
-    how many theta_h nodes further the other one starts, and phi_d; place (7, n): fractions along
-    theta_h (both samples), theta_d, phi_d, and the irradiance RGB.
+    The loop has no branches, so that the compiler vectorises it.
     """
+    n, v = sample.normal, sample.viewer
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
+    cell, place = stencil.cell, stencil.place
     n0, n1, n2 = n[0], n[1], n[2]
     v0, v1, v2 = v[0], v[1], v[2]
     half_pi = f32(0.5 * math.pi)
@@ -458,7 +626,7 @@ def _stencils(
         b0 = min(np.int32(y), np.int32(n_d - 2))
         z = phi_d * (f32(n_p - 1) / half_pi)
         c0 = min(np.int32(z), np.int32(n_p - 2))
-        # in the plane of incidence h moves half as far as wi, across it 1 / (2 cos theta_d) as far
+        # h moves half as far as wi in the plane of incidence, 1 / (2 cos theta_d) as far across
         stretch = f32(4.0) / max(squared, f32(0.01))
         ss = across * across / max(across * across + along * along, f32(1e-30))
         outward = f32(0.25) * leaves[12, q] * ((f32(1.0) - ss) + ss * stretch)
@@ -491,15 +659,22 @@ def _stencils(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
 def _collect(
-    row: Any, touched: Any, found: Any, n: Any, v: Any, share: Any, count: Any, leaves: Any,
-    n_h: Any, n_d: Any, n_p: Any, cell: Any, place: Any,
-) -> Any:  # fmt: skip
-    """Add one sample's leaves to a row (cells, 4), RGB and a filler.
+    whole: _Row,
+    found: Any,
+    sample: _Sample,
+    leaves: Any,
+    count: Any,
+    tables: Tables,
+    stencil: _Stencil,
+) -> Any:
+    """Add the first `count` leaves of one sample to a row.
 
-    `touched[0]` lists the `found` pairs of theta_h and theta_d that hold something, `touched[1]`
-    says which these are; returns how many there are now.
+    `found` pairs of theta_h and theta_d of the row are not zero so far; returns how many are now.
     """
-    _stencils(n, v, leaves, count, n_h, n_d, n_p, cell, place)
+    _stencils(sample, leaves, count, tables, stencil)
+    row, touched = whole.values, whole.touched
+    share, n_d, n_p = sample.share, tables.n_d, tables.n_p
+    cell, place = stencil.cell, stencil.place
     for q in range(count):
         e0, e1, e2 = share * place[4, q], share * place[5, q], share * place[6, q]
         if e0 + e1 + e2 == f32(0.0):
@@ -525,7 +700,7 @@ def _collect(
                     row[k, 0] += w0 * e0
                     row[k, 1] += w0 * e1
                     row[k, 2] += w0 * e2
-                    row[k, 3] += w0  # nothing reads it, but four are one vector
+                    row[k, 3] += w0  # padding: four numbers make one vector instruction
                     row[k + 1, 0] += w1 * e0
                     row[k + 1, 1] += w1 * e1
                     row[k + 1, 2] += w1 * e2
@@ -534,9 +709,12 @@ def _collect(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
-def _release(out: Any, row: Any, touched: Any, found: Any, n_p: Any, tables: Any) -> None:
-    """Add a row to `out`: (3, T) its radiance under tables (cells, T), or (3, cells) itself where
-    `tables` has no column; then clear it."""
+def _release(out: Any, whole: _Row, found: Any, shown: Tables) -> None:
+    """Add a row, or its radiance under tables, to `out`; then clear the row.
+
+    `out` is (3, T) radiance, or the row itself (3, cells) where the tables have no column.
+    """
+    row, touched, n_p, tables = whole.values, whole.touched, shown.n_p, shown.values
     for j in range(found):
         i = touched[0, j]
         touched[1, i] = 0
@@ -569,74 +747,95 @@ def _release(out: Any, row: Any, touched: Any, found: Any, n_p: Any, tables: Any
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def one_leaf(
-    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any,
-    n_h: Any, n_d: Any, n_p: Any, tables: Any,
-) -> None:  # fmt: skip
-    """Add one leaf (13, 1) a sample: to radiance, or to rows where `tables` has no column."""
+    out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any, tables: Tables
+) -> None:
+    """Add a light that is one leaf for every sample, such as a point light.
+
+    Parameters
+    ----------
+    out : (m, 3, T) or (m, 3, cells) float32
+        Radiance under the tables, or rows where the tables have no column; the light is added.
+    starts : (m + 1,) int64
+        The samples of fragment f are `starts[f]` to `starts[f + 1] - 1`.
+    normals, views : (n, 3) float32 unit vectors in the map's frame
+    share : (n,) float32 share of each sample in its fragment
+    leaves : (n, 13, 1) float32 direction, vector irradiance RGB, variance
+    tables : Tables
+    """
     block = 64
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
     for u in numba.prange((len(out) + block - 1) // block):
-        cell = np.empty((3, 1), np.int32)
-        part = np.empty((7, 1), np.float32)
-        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
-        touched = np.zeros((2, n_h * n_d), np.int32)
+        stencil = _Stencil(np.empty((3, 1), np.int32), np.empty((7, 1), np.float32))
+        row = _Row(np.zeros((n_h * n_d * n_p, 4), np.float32), np.zeros((2, n_h * n_d), np.int32))
         for f in range(u * block, min(u * block + block, len(out))):
             found = 0
             for p in range(starts[f], starts[f + 1]):
-                found = _collect(
-                    row, touched, found, normals[p], views[p], share[p], 1, leaves[p],
-                    n_h, n_d, n_p, cell, part,
-                )  # fmt: skip
-            _release(out[f], row, touched, found, n_p, tables)
+                sample = _Sample(normals[p], views[p], share[p])
+                found = _collect(row, found, sample, leaves[p], 1, tables, stencil)
+            _release(out[f], row, found, tables)
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
 def shade_rows(
-    out: Any, short: Any, ask: Any, asked: Any, answers: Any, final: Any,
-    bundle_start: Any, group_start: Any, target: Any, normals: Any, views: Any, share: Any,
-    middle_normals: Any, middle_views: Any, spread: Any, masks: Any, several: Any,
-    place: Any, moment: Any, child: Any, box: Any, image: Any,
-    first: Any, last: Any, hidden: Any, unseen: Any, unhidden: Any,
-    rules: Any, low: Any, high: Any, outline: Any, lobe: Any, capacity: Any,
-    n_h: Any, n_d: Any, n_p: Any, tables: Any,
+    out: Any, asked: Any, questions: Questions, bundles: Any, tree: TreeArrays,
+    masks: VisibilityMasks, settings: QuadratureSettings, tables: Tables,
 ) -> None:  # fmt: skip
-    """Add the leaves of all groups: to radiance, or to rows where `tables` has no column.
+    """Add the light of all groups of samples, a bundle of groups at a time.
 
-    Unless this is the `final` call, groups with questions are left out; groups with more leaves
-    than the capacity always are (`short`).
+    Parameters
+    ----------
+    out : (m, 3, T) or (m, 3, cells) float32
+        Radiance under the tables, or rows where the tables have no column; the light is added.
+    asked : (groups,) int64
+        Set to the number of each group's questions, or to -1 where a group has more leaves than
+        the capacity; such groups add nothing. Groups with questions add nothing either, unless
+        the answers are final.
+    questions : Questions
+    bundles : visibility.Bundles
+    tree : TreeArrays
+    masks : VisibilityMasks
+    settings : QuadratureSettings
+    tables : Tables
     """
     block = 16
-    bundles = len(bundle_start) - 1
-    for u in numba.prange((bundles + block - 1) // block):
-        stack = np.empty(512, np.int32)
-        fates = np.empty(512, np.int8)
-        cells = np.empty((512, 6), np.float32)
+    bundle_count = len(bundles.bundle_start) - 1
+    n_h, n_d, n_p = tables.n_h, tables.n_d, tables.n_p
+    capacity, final = settings.capacity, questions.final
+    for u in numba.prange((bundle_count + block - 1) // block):
+        pending = _Pending(
+            np.empty(512, np.int32), np.empty(512, np.int8), np.empty((512, 6), np.float32)
+        )
         leaves = np.empty((13, capacity), np.float32)
-        cell = np.empty((3, capacity), np.int32)
-        part = np.empty((7, capacity), np.float32)
-        # every sample of a fragment goes into one row: its neighbours touch the same cells
-        row = np.zeros((n_h * n_d * n_p, 4), np.float32)
-        touched = np.zeros((2, n_h * n_d), np.int32)
+        stencil = _Stencil(np.empty((3, capacity), np.int32), np.empty((7, capacity), np.float32))
+        # all samples of a fragment share a row, since they touch nearly the same cells
+        row = _Row(np.zeros((n_h * n_d * n_p, 4), np.float32), np.zeros((2, n_h * n_d), np.int32))
         found, current = 0, -1
-        for g in range(bundle_start[u * block], bundle_start[min(u * block + block, bundles)]):
-            count, asked[g] = _walk(
-                leaves, ask[g], answers[g], middle_normals[g], middle_views[g], masks[g],
-                place, moment, child, box, image, first, last, hidden, unseen, unhidden,
-                spread[g], rules[1 if several[g] else 0], low, high, outline, lobe,
-                stack, fates, cells,
+        first = bundles.bundle_start[u * block]
+        last = bundles.bundle_start[min(u * block + block, bundle_count)]
+        for g in range(first, last):
+            frame = _Frame(
+                bundles.middle_normals[g], bundles.middle_views[g], bundles.masks[g],
+                bundles.spread[g],
             )  # fmt: skip
+            wanted = (
+                settings.rules[1 if bundles.several[g] else 0],
+                settings.low, settings.high, settings.outline, settings.lobe,
+            )  # fmt: skip
+            count, rays = _walk(
+                leaves, questions.ask[g], questions.answers[g], frame, tree, masks, wanted, pending
+            )
+            asked[g] = -1 if count == capacity else rays
             if count == capacity:
-                short[g] = True
                 continue
-            if asked[g] > 0 and not final:
+            if rays > 0 and not final:
                 continue
-            for p in range(group_start[g], group_start[g + 1]):
-                if target[p] != current and found > 0:
-                    _release(out[current], row, touched, found, n_p, tables)
+            for p in range(bundles.group_start[g], bundles.group_start[g + 1]):
+                target = bundles.target[p]
+                if target != current and found > 0:
+                    _release(out[current], row, found, tables)
                     found = 0
-                current = target[p]
-                found = _collect(
-                    row, touched, found, normals[p], views[p], share[p], count, leaves,
-                    n_h, n_d, n_p, cell, part,
-                )  # fmt: skip
+                current = target
+                sample = _Sample(bundles.normals[p], bundles.views[p], bundles.share[p])
+                found = _collect(row, found, sample, leaves, count, tables, stencil)
         if found > 0:
-            _release(out[current], row, touched, found, n_p, tables)
+            _release(out[current], row, found, tables)

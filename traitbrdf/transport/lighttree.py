@@ -1,7 +1,7 @@
-"""The light of a map as a tree: clusters of texels, their moments and extents.
+"""The light of an environment map as a tree of rectangles.
 
-After the light tree of Walter et al. 2005 (Lightcuts, section 3.1), with exact vector irradiance in
-the place of a representative light.
+This is the light tree of Walter et al. 2005 (Lightcuts, section 3.1), except that a node stores the
+exact vector irradiance of its texels, not one representative light.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.scene.lights import EnvironmentMap, texel_moments
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 
-_ROWS = 1024
-"""Rows of leaves of a light tree, if there are texels enough: a node takes some 300 bytes."""
+ROWS = 1024
+"""Most rows of leaves of a light tree: a node takes some 300 bytes."""
 
 _BLOCK = 16
 """Most texels along the side of a leaf."""
@@ -30,20 +31,20 @@ _BLOCK = 16
 class LightTree:
     """An environment map as a binary tree of lat-long rectangles, the root first.
 
-    A node's `moment` is the exact vector irradiance of its light, colour by colour, so that a
-    Lambert surface sees no difference between a node and its texels; `direction` and `spread` are
-    the mean and the standard deviation of where that light comes from. Rectangles without light
-    are left out. The leaves are texels; of a map of more than `_ROWS` rows they are blocks of them.
+    A node's `moment` is the exact vector irradiance of its light in each colour, so that a Lambert
+    surface shows no difference between a node and its texels. `direction` and `spread` are the
+    mean and the standard deviation of the directions of that light. Rectangles without light are
+    left out. The leaves are texels, or blocks of texels in a map of more than `ROWS` rows.
 
     Attributes
     ----------
     moment : (n, 3, 3) float32, integral of radiance (first axis: colour) times direction
     direction : (n, 3) float32 unit, in the map's frame
-    spread : (n,) float32, standard deviation about the centroid along one axis, radians
+    spread : (n,) float32, standard deviation about `direction` along one axis, radians
     radius : (n,) float32, half the rectangle's diagonal, radians
     child : (n, 2) int32, indices of the halves; -1 where there is none
     rectangle : (n, 4) int32: first and last + 1 row, first and last + 1 column
-    block : height and width of a leaf in texels; less at the map's last row and column
+    block : height and width of a leaf in texels; leaves at the last row and column may be smaller
     """
 
     moment: NDArray[np.float32]
@@ -55,9 +56,8 @@ class LightTree:
     block: int = 1
 
     @cached_property
-    def packed(self) -> tuple[NDArray[Any], ...]:
-        """What a walk reads of a node, by how often: place and size (n, 8), irradiance (n, 12),
-        children (n, 2), -2 where the node is a leaf, and rectangle (n, 4)."""
+    def packed(self) -> tuple[Float32, Float32, Int32, Int32]:
+        """Arrays for the compiled walk: the first four of `arrays.TreeArrays`."""
         place = np.zeros((len(self.radius), 8), np.float32)
         place[:, :3] = self.direction
         place[:, 3] = self.radius
@@ -71,18 +71,25 @@ class LightTree:
 
     @cached_property
     def flux(self) -> NDArray[np.float64]:
-        """(n,) length of each node's vector irradiance, all colours together."""
+        """Length (n,) of each node's vector irradiance, all colours together."""
         red, green, blue = self.moment.astype(np.float64).transpose(1, 0, 2)
         return np.asarray(np.linalg.norm(red + green + blue, axis=-1))
 
     @classmethod
-    def build(cls, environment: EnvironmentMap) -> LightTree:
-        """Split the map in halves, across the longer side, down to the leaves."""
+    def build(cls, environment: EnvironmentMap, most_rows: int = ROWS) -> LightTree:
+        """Build the tree of a map: halve rectangles across their longer side, down to leaves.
+
+        Parameters
+        ----------
+        environment : EnvironmentMap
+        most_rows : int
+            Maps of more rows get leaves that are blocks of 2, 4, 8 or 16 texels a side.
+        """
         rows, columns, _ = environment.image.shape
         block = 1
-        while rows > _ROWS * block and block < _BLOCK:
+        while rows > most_rows * block and block < _BLOCK:
             block *= 2
-        # all of this counts in blocks
+        # until the end, rectangles are in units of blocks
         m, n = -(-rows // block), -(-columns // block)
         down = np.minimum(block * np.arange(m + 1), rows)
         across = np.minimum(block * np.arange(n + 1), columns)
@@ -114,7 +121,7 @@ class LightTree:
             count += len(halves)
         box = np.concatenate(levels)
         child = np.concatenate(children)
-        # sums run from the leaves up, so that a dim sky survives beside a bright sun
+        # summing from the leaves up keeps a dim sky beside a bright sun
         moment = np.zeros((len(box), 3, 3))
         flux = np.zeros(len(box))
         leaf = child[:, 0] < 0
@@ -152,8 +159,13 @@ class LightTree:
 
 
 def _block_light(environment: EnvironmentMap, block: int) -> tuple[Float64, Float64]:
-    """Light of blocks of texels, radiance times solid angle of all colours together, and their
-    moments (..., 3, 3)."""
+    """Sum the light of blocks of texels.
+
+    Returns
+    -------
+    light : (m, n) radiance times solid angle, all colours together
+    shine : (m, n, 3, 3) vector irradiance, colour first
+    """
     rows, columns, _ = environment.image.shape
     m, n = -(-rows // block), -(-columns // block)
     light, shine = np.empty((m, n)), np.empty((m, n, 3, 3))
@@ -172,8 +184,11 @@ def _block_light(environment: EnvironmentMap, block: int) -> tuple[Float64, Floa
 def _extent(
     box: NDArray[np.int64], edges: Float64, across: NDArray[np.int64]
 ) -> tuple[Float64, Float64]:
-    """Angular height and greatest width of rectangles (n, 4), radians, from the polar angles of
-    their rows and the texels of their columns, of which the last edge counts all."""
+    """Return angular height and greatest width of rectangles (n, 4), in radians.
+
+    `edges` are the polar angles of the row edges, `across` the texel columns of the column edges;
+    the last of these is the number of columns.
+    """
     top, bottom = edges[box[:, 0]], edges[box[:, 1]]
     widest = np.where(
         (top <= math.pi / 2) & (bottom >= math.pi / 2),

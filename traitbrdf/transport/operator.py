@@ -1,26 +1,27 @@
 """Rows of the transport operator: the light that reaches a pixel, cut into leaves of one tree.
 
-For one pixel I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d): linear in the table's
-cells. A *leaf* is a piece of the environment map with its exact vector irradiance. `Operator`
-turns leaves into rows (a weight for every cell) or, far cheaper, into images of given tables.
+The radiance of a pixel is I = sum over leaves of E_leaf * f(theta_h, theta_d, phi_d), which is
+linear in the table's cells. A *leaf* is a piece of the environment map with its exact vector
+irradiance. `Operator` turns leaves into rows (a weight for every cell) or, which is much cheaper,
+into images of given tables.
 
-*Leaves.* The map is walked as a tree (`LightTree`; Walter et al. 2005): a node of light stands for
+*Leaves.* The map is walked as a tree (`LightTree`; Walter et al. 2005). A node of light stands for
 its texels where it looks small from the mirror peak, measured in half-vector space; a texel that
-looks large is cut further. A node's irradiance is exact, and its own extent is carried into theta_h
-to second order (two samples one standard deviation apart), so the error falls with the fourth power
-of the node size while the number of nodes grows with its inverse square.
+looks large is cut further. A node's irradiance is exact, and its extent is carried into theta_h to
+second order (two samples one standard deviation apart). So the error falls with the fourth power of
+the node size, while the number of nodes grows with its inverse square.
 
-*Shadows.* A cut through the tree, some thousand nodes of little light each, gets one shadow ray a
-node (`VisibilityCut`), bright lights down to single texels. Neighbouring pixels see nearly the same
-occluders: rays are cast on a coarse lattice of pixels, and between lattice points only where those
-around disagree; at borders, where a pixel's samples lie on either side of an edge, of every sample.
-Near the mirror direction, where a glossy surface shows the occluder's outline, leaves at that
-outline cast their own rays.
+*Shadows.* A cut through the tree has some thousand nodes of little light each, and bright lights
+are cut down to single texels. Each node of the cut gets one shadow ray (`VisibilityCut`).
+Neighbouring pixels see nearly the same occluders, so rays are cast on a coarse lattice of pixels,
+and between lattice points only where the points around disagree. At borders, where the samples of a
+pixel lie on both sides of an edge, rays are cast for every sample. A glossy surface shows the
+outline of an occluder near the mirror direction; leaves there cast rays of their own.
 
-*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel: they are
-computed on the lattice and interpolated, wherever normals and shadows vary linearly over its
-cells; elsewhere, and for the narrow rest, every pixel is computed. The two are separated by a
-smooth window over theta_h, so their sum is exact.
+*Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel. These far
+images are computed on the lattice, and interpolated wherever normals and shadows vary linearly over
+its cells. Elsewhere, and for the narrow rest (near images), every pixel is computed. A smooth
+window over theta_h separates the two, so their sum is exact.
 
 References
 ----------
@@ -33,7 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,14 @@ from traitbrdf.directions import reflect
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.lights import EnvironmentMap, turn_about_y
 from traitbrdf.scene.scene import Scene
-from traitbrdf.transport.kernels import interpolate_masks, one_leaf, shade_rows
+from traitbrdf.transport.arrays import (
+    QuadratureSettings,
+    Questions,
+    Tables,
+    TreeArrays,
+    VisibilityMasks,
+)
+from traitbrdf.transport.kernels import interpolate_images, one_leaf, shade_rows
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.visibility import (
     Bundles,
@@ -62,37 +70,61 @@ Int64 = NDArray[np.int64]
 f32 = np.float32
 
 _SPLIT = (0.15, 0.35)
-"""theta_h in radians between which the window passes from near to far, at a scale of 1."""
+"""theta_h in radians over which the window passes from near to far, at a scale of 1."""
 
-_FLAT = 0.03
-"""How much of their largest value tables may change within the width of their lobes."""
+FLAT = 0.03
+"""Greatest change of a table within the width of its lobe, relative to its largest value."""
 
 _OUTLINE = 0.03
-"""theta_h in radians up to which leaves at the outline of an occluder cast their own rays."""
+"""theta_h in radians up to which leaves at an occluder's outline cast rays of their own."""
 
 _CUT = (0.09, 1 / 500)
-"""Greatest radius (radians) and share of the flux of a node whose visibility is one bit."""
+"""Greatest radius (radians) and greatest share of the flux of a node of the visibility cut."""
 
 _QUESTIONS = 192
-"""Most rays of its own that a sample casts at occluders' outlines."""
+"""Most rays that a group of samples casts at the outlines of occluders."""
 
 CORE = 3e-3
-"""theta_h in radians: leaves at a mirror peak are as small as peaks of twice that width need."""
+"""theta_h in radians: half the width of the narrowest peak that leaves resolve by default."""
 
 SHARPEST = 1e-4
-"""The same for the narrowest peaks that a table holds."""
-
-_ALL = (-1.0, 9.0)
+"""theta_h in radians: half the width of the narrowest peak that any table is resolved to."""
 
 _SHARED = ((4, 0.002), (2, 0.007))
-"""Blocks of pixels that share one walk, and how far their half vectors may differ (radians)."""
+"""Side in pixels of blocks that share one walk, and how far their half vectors may differ in
+radians."""
 
 _UNITED = 0.007
-"""The same for the samples of one fragment."""
+"""How far the half vectors of the samples of a fragment may differ for one walk, in radians."""
+
+
+class _Lobes(NamedTuple):
+    """The lobes that leaves have to resolve.
+
+    Attributes
+    ----------
+    window : range of theta_h in radians of the light that is added
+    width : theta_h in radians within which the tables hardly change
+    core : half the width of the narrowest peak in radians; None for the operator's
+    exact : whether leaves are as fine as sharp lobes need at silhouettes
+    """
+
+    window: tuple[float, float] = (-1.0, 9.0)
+    width: float = 0.0
+    core: float | None = None
+    exact: bool = False
+
+
+class _Light(NamedTuple):
+    """What the walk reads beside the samples."""
+
+    tree: TreeArrays
+    masks: VisibilityMasks
+    settings: QuadratureSettings
 
 
 class Operator:
-    """Rows of W: what every cell of a table contributes to a fragment of the scene.
+    """The transport operator W of a scene: what every cell of a table adds to every fragment.
 
     Parameters
     ----------
@@ -100,12 +132,28 @@ class Operator:
     grid : HalfDiffGrid of the "folded" layout
     resolution : float
         1 is the default; 2 halves the size of the light's leaves and of the visibility nodes.
-    tree : what `light_tree` makes of the scene's map, if it is at hand
+    tree : LightTree or None
+        What `light_tree` makes of the scene's map, if it was built before.
     core : float
-        In radians, half the width in theta_h of the narrowest peak that rows and interpolated
-        images resolve. Exact images resolve what their tables hold.
+        Half the width in theta_h, in radians, of the narrowest peak that rows and interpolated
+        images resolve. Exact images resolve the peaks of their tables.
     shadows : float or None
-        The same as `resolution` for the visibility nodes alone; None: as that has it.
+        Resolution of the visibility nodes alone; None for `resolution`.
+
+    Attributes
+    ----------
+    visibility : Visibility or None
+        Shared visibility of the fragments; None where nothing casts shadows.
+    rules, exact_rules : (2, 4) float32
+        How finely leaves are cut for interpolated and for exact images: the first four columns of
+        `QuadratureSettings.rules`.
+    capacity : int
+        Room for the leaves of one group of samples; doubled for groups that need more.
+
+    Raises
+    ------
+    ValueError
+        If the grid has another layout, or a number is not positive and finite.
     """
 
     def __init__(
@@ -131,46 +179,56 @@ class Operator:
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
             tree = LightTree.build(environment)
         self.tree = tree
-        self._nodes = self.tree.packed
-        self._image = environment.image
+        self._nodes = TreeArrays(*self.tree.packed, environment.image)
         scale = 1.0 / resolution
-        # sharp lobes are lost where the leaves at their peaks grow wider than these
+        # wider leaves than these at a peak would lose sharp lobes
         rule = np.array([0.5 * min(scale, 4.0), scale**2 / 200.0, 0.05 * scale, 0.1 * scale])
         border = rule * (1.6, 2.56, 1.6, 1.6)  # the eight samples of a fragment share the error
-        # exact images are asked for where lobes are sharp: at a silhouette's grazing angles they
-        # need leaves of half that size
+        # exact images serve sharp lobes, which need leaves of half that size at the grazing angles
+        # of a silhouette
         fine = border * (0.5 / 1.6, 1.0, 1.0, 1.0)
-        self._rules = np.stack([rule, border]).astype(np.float32)
-        self._exact_rules = np.stack([rule, fine]).astype(np.float32)
-        self._capacity = int(1600 * resolution**2) + 200
+        self.rules = np.stack([rule, border]).astype(np.float32)
+        self.exact_rules = np.stack([rule, fine]).astype(np.float32)
+        self.capacity = int(1600 * resolution**2) + 200
         to_map = scene.environment.to_map
         self._normals = np.ascontiguousarray(to_map(scene.normals), np.float32)
         self._views = np.ascontiguousarray(to_map(scene.views), np.float32)
-        # the sample that stands for a fragment where one must: the middle one
+        # where one sample has to stand for a fragment, it is the middle one
         self._middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
-        self._visibility: Visibility | None = None
+        self.visibility: Visibility | None = None
         if any(scene.casts):
             wide = 1.0 / (resolution if shadows is None else shadows)
             width = min(wide, math.sqrt(wide))  # shadows blur less well than lobes do
             cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
-            self._visibility = Visibility(scene, cut, self._middle)
+            self.visibility = Visibility(scene, cut, self._middle)
         self._plans: dict[int, Plan] = {}
 
     # -- single fragments -----------------------------------------------------------------------
 
     def rows(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3, grid.size) rows of the fragments `index` (m,), one for each colour."""
+        """Compute rows of W: (m, 3, grid.size) float32, one for each fragment and colour.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Fragments of the scene.
+        """
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, _NO_TABLES)
+        self._shade(out, at, self._mask_rows(at), _Lobes(), _NO_TABLES)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
     def rows_as_shown(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3, grid.size) rows of distinct fragments `index` (m,), as `part_images` sees them.
+        """Compute the rows of W, (m, 3, grid.size) float32, that `part_images` applies.
 
-        With the shadows and the leaves that they share with the pixels around: the images and
-        these rows are of one operator, while those of `rows` are a little nearer to the truth.
+        They use the shadows and the leaves that fragments share with the pixels around them, so
+        these rows and the images belong to one operator. Those of `rows` are slightly more exact.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Distinct fragments of the scene.
         """
         at = np.asarray(index, np.int64)
         out = np.zeros((len(at), 3, self.grid.size), np.float32)
@@ -182,22 +240,29 @@ class Operator:
             place = np.full(span.stop - span.start, -1)
             place[at[mine] - span.start] = mine
             everything = np.arange(span.start, span.stop)
-            masks = self._plan(part).mask_rows
-            self._shade(out, everything, masks, _ALL, _NO_TABLES, place=place)
+            masks = self.plan(part).mask_rows
+            self._shade(out, everything, masks, _Lobes(), _NO_TABLES, place=place)
         self._add_lights(out, at, _NO_TABLES)
         return out
 
     def images(self, index: NDArray[np.integer], tables: Float32) -> Float32:
-        """(m, 3, T) radiance of the fragments `index` (m,) under scalar tables (grid.size, T)."""
+        """Compute the radiance (m, 3, T) float32 of fragments under scalar tables.
+
+        Parameters
+        ----------
+        index : (m,) int
+            Fragments of the scene.
+        tables : (grid.size, T) float32, in 1/sr
+        """
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
-        self._shade(out, at, self._mask_rows(at), _ALL, tables, core=self._core_of(tables))
+        self._shade(out, at, self._mask_rows(at), _Lobes(core=self._core_of(tables)), tables)
         self._add_lights(out, at, tables)
         return out
 
     def mirror(self, index: NDArray[np.integer]) -> Float32:
-        """(m, 3) what a perfect mirror shows at the fragments `index` (m,)."""
+        """Compute the radiance (m, 3) float32 that a perfect mirror shows at fragments (m,)."""
         scene = self.scene
         index = np.asarray(index, np.int64)
         sample, owner, share = scene.samples(index)
@@ -208,7 +273,7 @@ class Operator:
         return out.astype(np.float32)
 
     def _core_of(self, tables: Float32) -> float:
-        return min(self.core, _core(self.grid, tables))
+        return min(self.core, core_of(self.grid, tables))
 
     # -- whole parts ----------------------------------------------------------------------------
 
@@ -219,12 +284,18 @@ class Operator:
         progress: Progress | None = None,
         interpolate: bool = True,
     ) -> Float32:
-        """(P, 3, T) radiance of all fragments of a part under scalar tables (grid.size, T).
+        """Compute the radiance (P, 3, T) float32 of all fragments of a part under scalar tables.
 
-        Shadows are interpolated where rays agree, and far images where that is safe, unless
-        `interpolate` is False: an order of magnitude faster than `images`. Lobes that are wide
-        for the part have nothing but far images, and no leaves finer than they need. Peaks narrower
-        than the operator's `core` are resolved only without interpolation.
+        Parameters
+        ----------
+        part : int
+            Index into ``scene.parts``.
+        tables : (grid.size, T) float32, in 1/sr
+        progress : called with (stage, fraction done); may raise to cancel
+        interpolate : bool
+            Interpolate shadows where rays agree, and far images where normals and shadows vary
+            linearly. This is ten times faster than `images`, and resolves peaks down to the
+            operator's `core` only. Tables without narrow lobes have far images alone, in any case.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
@@ -232,35 +303,37 @@ class Operator:
         tables = np.ascontiguousarray(tables, np.float32)
         if len(index) == 0:
             return np.zeros((0, 3, tables.shape[1]), np.float32)
-        plan = self._plan(part, report)
-        # narrower lobes are interpolated where neighbouring pixels differ less
+        plan = self.plan(part, report)
+        # where neighbouring pixels differ less, narrower lobes are interpolated too
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
         low, high = (float(self.grid.theta_h[node]) for node in nodes)
-        lobe = _lobe(self.grid, tables, plan.grazing)
-        broad = lobe >= high  # nothing is near
+        lobe = lobe_of(self.grid, tables, plan.grazing)
+        broad = lobe >= high  # there is no near image
         if not interpolate and not broad:
             out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
+            lobes = _Lobes(width=lobe, core=self._core_of(tables), exact=True)
             self._shade(
-                out, index, plan.mask_rows, _ALL, tables,
-                lambda fraction: report("exact images", fraction), exact=True, lobe=lobe,
-                core=self._core_of(tables),
+                out, index, plan.mask_rows, lobes, tables,
+                lambda fraction: report("exact images", fraction),
             )  # fmt: skip
             self._add_lights(out, index, tables)
             return out
         near = np.repeat(_near_window(self.grid, low, high), self.grid.size // self.grid.shape[0])
-        wide, far = (tables, _ALL) if broad else (tables * (1.0 - near)[:, None], (low, 9.0))
+        wide, far = tables, _Lobes(width=lobe)
+        if not broad:
+            wide, far = tables * (1.0 - near)[:, None], _Lobes((low, 9.0), lobe)
         coarse = np.zeros((len(plan.computed), 3, tables.shape[1]), np.float32)
         computed = index[plan.computed]
         self._shade(
             coarse, computed, self._own_rows(computed), far, wide,
-            lambda fraction: report("far images", fraction), lobe=lobe,
+            lambda fraction: report("far images", fraction),
         )  # fmt: skip
         out = np.empty((len(index), 3, tables.shape[1]), np.float32)
-        interpolate_masks(out, coarse, plan.corners, plan.weights)
+        interpolate_images(out, coarse, plan.corners, plan.weights)
         if not broad:
             self._shade(
-                out, index, plan.mask_rows, (-1.0, high), tables * near[:, None],
-                lambda fraction: report("near images", fraction), lobe=lobe,
+                out, index, plan.mask_rows, _Lobes((-1.0, high), lobe), tables * near[:, None],
+                lambda fraction: report("near images", fraction),
             )  # fmt: skip
         self._add_lights(out, index, tables)
         return out
@@ -268,7 +341,7 @@ class Operator:
     # -- leaves ---------------------------------------------------------------------------------
 
     def _bundles(self, index: Int64, mask_rows: NDArray[np.int32]) -> Bundles:
-        """The samples of fragments `index`, in groups that share one walk through the light."""
+        """Return the samples of fragments `index`, in groups that share one walk of the tree."""
         scene = self.scene
         sample, owner, share = scene.samples(index)
         count = np.bincount(owner, minlength=len(index))
@@ -277,7 +350,7 @@ class Operator:
         single = np.flatnonzero(count == 1)
         x, y = scene.pixels[index] % scene.width, scene.pixels[index] // scene.width
         part = scene.pixel_part[index].astype(np.int64)
-        group = np.full(len(index), -1, np.int64)  # of fragments of one sample
+        group = np.full(len(index), -1, np.int64)  # of each fragment of one sample
         found = 0
         for side, limit in _SHARED:
             key = (part[single] * (scene.height + side) + y[single] // side) * (
@@ -297,7 +370,7 @@ class Operator:
             group[member[joined]] = found + np.repeat(np.arange(alike.sum()), size[alike])
             found += int(alike.sum())
             single = np.sort(member[~joined])
-        # a bundle is a group of fragments, or one fragment, whose samples are a group each, or one
+        # a bundle is a group of fragments, or one fragment whose samples are one or many groups
         sampled = np.flatnonzero(count > 1)
         united = np.zeros(len(index), bool)
         if len(sampled):
@@ -307,8 +380,8 @@ class Operator:
                 scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
             )  # fmt: skip
         own_row = np.full(len(sample), -1, np.int32)
-        if self._visibility is not None:
-            own_row = self._visibility.row_of_sample[sample]
+        if self.visibility is not None:
+            own_row = self.visibility.row_of_sample[sample]
             united[owner[own_row >= 0]] = False
         alone = group < 0
         group[alone] = found + np.arange(alone.sum())
@@ -334,50 +407,50 @@ class Operator:
             first_rows(group_start, masks), several,
         )  # fmt: skip
 
-    def _light(
-        self, window: tuple[float, float], exact: bool, lobe: float, core: float
-    ) -> tuple[Any, ...]:
-        """What the walk needs beside the samples: nodes, masks and rules."""
-        low, high = math.sin(max(window[0], -0.5)), math.sin(min(window[1], 0.5 * math.pi))
-        cut, masks = _NO_CUT, _NO_MASKS
-        if self._visibility is not None:
-            cut = (self._visibility.cut.first, self._visibility.cut.last)
-            masks = self._visibility.masks
+    def _light(self, lobes: _Lobes) -> _Light:
+        """Return the nodes, masks and settings of a walk that resolves some lobes."""
+        low, high = lobes.window
+        low, high = math.sin(max(low, -0.5)), math.sin(min(high, 0.5 * math.pi))
+        masks = _NO_MASKS
+        if self.visibility is not None:
+            cut = self.visibility.cut
+            masks = VisibilityMasks(cut.first, cut.last, *self.visibility.masks)
+        exact = lobes.exact or self.resolution > 1.0
+        core = self.core if lobes.core is None else lobes.core
         rules = np.concatenate(
-            [self._exact_rules if exact else self._rules, np.full((2, 1), core, np.float32)], axis=1
+            [self.exact_rules if exact else self.rules, np.full((2, 1), core, np.float32)], axis=1
         )
-        return (
-            *self._nodes, self._image, *cut, *masks, rules,
-            f32(low), f32(high if high < 1.0 else 9.0),
-            f32(math.sin(_OUTLINE) if lobe <= _SPLIT[1] else -9.0), f32(math.sin(lobe)),
+        settings = QuadratureSettings(
+            rules, f32(low), f32(high if high < 1.0 else 9.0),
+            f32(math.sin(_OUTLINE) if lobes.width <= _SPLIT[1] else -9.0),
+            f32(math.sin(lobes.width)), self.capacity,
         )  # fmt: skip
+        return _Light(self._nodes, masks, settings)
 
     def _shade(
         self,
         out: Float32,
         index: Int64,
         mask_rows: NDArray[np.int32],
-        window: tuple[float, float],
+        lobes: _Lobes,
         tables: Float32,
         report: Callable[[float], None] = lambda fraction: None,
         place: Int64 | None = None,
-        exact: bool = False,
-        lobe: float = 0.0,
-        core: float | None = None,
     ) -> None:
-        """Add the light of theta_h in `window` to the fragments `index`: to their radiance under
-        `tables` (cells, T), or to their rows if there are no tables.
+        """Add the light of the map to fragments.
 
-        `mask_rows` (m, 4) are the visibility rows that surround each fragment, -1 for none.
-        `place` (m,) says where in `out` each fragment is; those of -1 are left out. `exact` takes
-        leaves for sharp lobes, `lobe` none that are finer than lobes of that width need, and `core`
-        (this operator's if left out) none that are wider at the peak than peaks of twice that width
-        bear.
+        Parameters
+        ----------
+        out : (m, 3, T) radiance under the tables, or (m, 3, cells) rows where T is 0
+        index : (m,) fragments
+        mask_rows : (m, 4) visibility rows that surround each fragment, -1 for none
+        lobes : which leaves are taken
+        tables : (cells, T)
+        report : called with the fraction done
+        place : (m,) where in `out` each fragment is; those of -1 are left out
         """
         step = 1 << 13
-        light = self._light(
-            window, exact or self.resolution > 1.0, lobe, self.core if core is None else core
-        )
+        light = self._light(lobes)
         for i in range(0, len(index), step):
             at = slice(i, min(i + step, len(index)))
             if place is not None and not (place[at] >= 0).any():
@@ -388,56 +461,44 @@ class Operator:
             self._shade_all(target, bundles, light, tables)
             report(at.stop / len(index))
 
-    def _shade_all(
-        self, out: Float32, bundles: Bundles, light: tuple[Any, ...], tables: Float32
-    ) -> None:
-        """Shade bundles, those again that have more leaves than there was room for."""
-        capacity = self._capacity
+    def _shade_all(self, out: Float32, bundles: Bundles, light: _Light, tables: Float32) -> None:
+        """Shade bundles; repeat with twice the room those that have more leaves than it holds."""
+        settings = light.settings._replace(capacity=self.capacity)
         while len(bundles.several):
-            bundles = bundles.take(self._shade_some(out, bundles, light, tables, capacity))
-            capacity *= 2
+            light = light._replace(settings=settings)
+            bundles = bundles.take(self._shade_some(out, bundles, light, tables))
+            settings = settings._replace(capacity=2 * settings.capacity)
 
     def _shade_some(
-        self,
-        out: Float32,
-        bundles: Bundles,
-        light: tuple[Any, ...],
-        tables: Float32,
-        capacity: int,
+        self, out: Float32, bundles: Bundles, light: _Light, tables: Float32
     ) -> NDArray[np.bool_]:
-        """Shade bundles; returns which groups have more leaves than the capacity."""
+        """Shade bundles, and return which groups have more leaves than the capacity."""
         groups = len(bundles.several)
-        short = np.zeros(groups, np.bool_)
+        shown = Tables(*self.grid.shape, tables)
         asked = np.zeros(groups, np.int64)
         ask = np.empty((groups, _QUESTIONS, 3), np.float32)
-        answers = np.ones((groups, _QUESTIONS), np.uint8)
-        rest = (capacity, *self.grid.shape, tables)
-        shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
-            out, short, ask, asked, answers, False, *bundles.for_the_walk(), *light, *rest
-        )  # fmt: skip
-        again = (asked > 0) & ~short
-        # where rays decide, pixels do not share them
+        unanswered = Questions(ask, np.ones((groups, _QUESTIONS), np.uint8), False)
+        shade_rows(out, asked, unanswered, bundles, *light, shown)
+        again = asked > 0
+        # pixels that need rays do not share a walk
         shared = again & (np.diff(bundles.group_start) > 1)
         again &= ~shared
         if shared.any():
-            apart = bundles.take(shared).separated()
-            self._shade_all(out, apart, light, tables)
+            self._shade_all(out, bundles.take(shared).separated(), light, tables)
         if again.any():
             local, which = questions(ask[again], asked[again])
             toward = turn_about_y(local, self.scene.environment.rotation)
             some = bundles.take(again)
-            answers = np.ones((len(some.several), _QUESTIONS), np.uint8)
+            count = len(some.several)
+            answers = np.ones((count, _QUESTIONS), np.uint8)
             asker = some.sample[some.group_start[:-1]]
             answers[which] = self.scene.visible(asker[which[0]], toward)
-            count = len(some.several)
-            shade_rows(  # type: ignore[call-arg]  # numba's decorator hides the signature
-                out, np.zeros(count, np.bool_), ask[:count], asked[:count], answers, True,
-                *some.for_the_walk(), *light, *rest,
-            )  # fmt: skip
-        return short
+            final = Questions(ask[:count], answers, True)
+            shade_rows(out, np.zeros(count, np.int64), final, some, *light, shown)
+        return asked < 0
 
     def _add_lights(self, out: Float32, index: Int64, tables: Float32) -> None:
-        """Add the point and directional lights, each one leaf a sample."""
+        """Add the point and directional lights: each is one leaf for every sample."""
         scene = self.scene
         step = 1 << 16
         for light in scene.lights:
@@ -448,26 +509,26 @@ class Operator:
                 leaves = np.zeros((len(sample), 13, 1), np.float32)
                 local = scene.environment.to_map(toward)
                 leaves[:, :3, 0] = local
-                # the vector irradiance of a light: what faces it fully gets it fully
+                # vector irradiance: a surface that faces the light gets all of it
                 leaves[:, 3:12, 0] = (irradiance[:, :, None] * local[:, None, :]).reshape(-1, 9)
                 starts = np.searchsorted(owner, np.arange(at.stop - at.start + 1)).astype(np.int64)
                 one_leaf(
                     out[at], starts, self._normals[sample], self._views[sample],
-                    share.astype(np.float32), leaves, *self.grid.shape, tables,
+                    share.astype(np.float32), leaves, Tables(*self.grid.shape, tables),
                 )  # fmt: skip
 
     # -- visibility -----------------------------------------------------------------------------
 
     def _own_rows(self, index: Int64) -> NDArray[np.int32]:
-        """(m, 4) with each fragment's own visibility row first, -1 where it has none."""
+        """Return (m, 4) with each fragment's own visibility row first; -1 for none."""
         rows = np.full((len(index), 4), -1, np.int32)
-        if self._visibility is not None:
-            rows[:, 0] = self._visibility.row_of[index]
+        if self.visibility is not None:
+            rows[:, 0] = self.visibility.row_of[index]
         return rows
 
     def _mask_rows(self, index: Int64) -> NDArray[np.int32]:
-        """Own rows (m, 4) of any fragments; rays are cast for those that have none yet."""
-        visibility = self._visibility
+        """Return own rows (m, 4) of any fragments, and cast rays for those that have none yet."""
+        visibility = self.visibility
         if visibility is None or not len(index):
             return self._own_rows(index)
         casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
@@ -483,26 +544,36 @@ class Operator:
         return self._own_rows(index)
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
-        """Cast a part's rays and find where its far images are computed, if that is not done."""
-        self._plan(part, progress)
+        """Cast a part's rays and choose where its far images are computed, unless that is done.
 
-    def _plan(self, part: int, progress: Progress | None = None) -> Plan:
+        Parameters
+        ----------
+        part : int
+            Index into ``scene.parts``.
+        progress : called with (stage, fraction done); may raise to cancel
+        """
+        self.plan(part, progress)
+
+    def plan(self, part: int, progress: Progress | None = None) -> Plan:
+        """Return where a part's far images are computed; see `prepare`."""
         if part not in self._plans:
             report = progress or (lambda stage, fraction: None)
             loose = max(1.0, 1.0 / self.resolution)
             fine = self.resolution > 1.0
-            self._plans[part] = Plan.make(self.scene, part, self._visibility, loose, fine, report)
+            self._plans[part] = Plan.make(self.scene, part, self.visibility, loose, fine, report)
         return self._plans[part]
 
 
 def light_tree(environment: EnvironmentMap) -> LightTree:
-    """The tree that an `Operator` walks; build it once for several operators under one map."""
+    """Build the tree that an `Operator` walks, to share it between operators under one map."""
     return LightTree.build(_divided(environment))
 
 
 def _divided(environment: EnvironmentMap) -> EnvironmentMap:
-    """The same light in texels of at most 1/256 of a half turn: each is hidden or not as a whole,
-    and small enough for series about its centre."""
+    """Return the same light in texels of at most 1/256 of a half turn.
+
+    A texel is visible or hidden as a whole, and the walk uses series about its centre.
+    """
     rows, columns, _ = environment.image.shape
     down, across = -(-256 // rows), -(-512 // columns)
     if down == across == 1:
@@ -512,28 +583,42 @@ def _divided(environment: EnvironmentMap) -> EnvironmentMap:
 
 
 def _near_window(grid: HalfDiffGrid, low: float, high: float) -> Float32:
-    """(theta_h nodes,) 1 for the narrow lobes' cells, falling smoothly to 0 from `low` to `high`,
-    which are nodes: so leaves of either side meet none of the other's."""
+    """Return the window (theta_h nodes,) of near images: 1, then a smooth fall to 0.
+
+    The fall begins at `low` and ends at `high`. Both are nodes, so no leaf beyond either of them
+    touches a cell of the other side.
+    """
     t = np.clip((grid.theta_h - low) / (high - low), 0.0, 1.0)
     return np.asarray(1.0 - t * t * (3.0 - 2.0 * t), np.float32)
 
 
-def _lobe(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
-    """The theta_h within which tables (grid.size, T) hardly change: the width of their lobes.
+def lobe_of(grid: HalfDiffGrid, tables: Float32, grazing: float) -> float:
+    """Return the theta_h in radians within which tables hardly change: the width of their lobes.
 
-    Views further from the normal than `grazing` are not asked for.
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    tables : (grid.size, T) float32
+    grazing : float
+        Largest angle in radians of a view from its normal; cells beyond it do not count.
     """
     seen = grid.theta_d <= grazing + _SPLIT[1]
     values = tables.reshape(*grid.shape, -1)[:, seen].reshape(grid.shape[0], -1, tables.shape[1])
-    change = np.abs(values - values[0]).max(axis=1) > _FLAT * np.abs(values).max(axis=(0, 1))
+    change = np.abs(values - values[0]).max(axis=1) > FLAT * np.abs(values).max(axis=(0, 1))
     steps = np.flatnonzero(change.any(axis=1))
     return float(grid.theta_h[max(steps[0] - 1, 0)]) if len(steps) else 0.5 * math.pi
 
 
-def _core(grid: HalfDiffGrid, tables: Float32) -> float:
-    """Half the theta_h within which the narrowest peak of tables (grid.size, T) falls to its half.
+def core_of(grid: HalfDiffGrid, tables: Float32) -> float:
+    """Return half the theta_h in radians where the narrowest peak of tables falls to its half.
 
-    Peaks are looked for where they are a notable share of their table's; `CORE` at most.
+    Only peaks above a hundredth of their table's highest count. The result is from `SHARPEST` to
+    `CORE`.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid
+    tables : (grid.size, T) float32
     """
     nodes = int(np.searchsorted(grid.theta_h, 2.0 * CORE)) + 1
     values = tables.reshape(grid.shape[0], -1, tables.shape[1])[:nodes]
@@ -546,5 +631,5 @@ def _core(grid: HalfDiffGrid, tables: Float32) -> float:
 
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
-_NO_CUT = (np.zeros(1, np.int32), np.zeros(1, np.int32))
-_NO_MASKS = tuple(np.zeros((1, 1), np.uint64) for _ in range(3))
+_NO_NODES, _NO_WORDS = np.zeros(1, np.int32), np.zeros((1, 1), np.uint64)
+_NO_MASKS = VisibilityMasks(_NO_NODES, _NO_NODES, _NO_WORDS, _NO_WORDS, _NO_WORDS)

@@ -1,24 +1,26 @@
 """Real-time frames: light transport as a linear operator from table cells to pixels, compressed.
 
 For one scene the radiance of a fragment (what one part shows in one pixel) is linear in the BRDF
-table, I = W rho (Ben-Artzi et al. 2006, section 3); `Operator` knows the rows of W, shadows
+table, I = W rho (Ben-Artzi et al. 2006, section 3). `Operator` computes the rows of W, shadows
 included.
 
-*Basis.* Seen through one part of one scene, the BRDFs of interest span few dimensions. From the
-rows W_S of a subset S of fragments and training tables X, the SVD of the column-normalised
+*Basis.* Through one part of one scene, the BRDFs of interest span few dimensions. Take the rows W_S
+of a subset S of the fragments, and training tables X. The SVD of the column-normalised
 W_S X = U Sigma Y^T gives the combinations M = X Y Sigma^-1 of training tables whose images W M span
-the frames; Q are the leading left singular vectors of W M Sigma. The three colours of a map light
-a shape much alike, so one Q serves them all: 96 columns err less than three times 64, and a frame
-reads them once. Frame = Q (C rho), with a C for each colour. The orthogonal choice C = Q^T W needs
-every row; weighted least squares on some five times more rows than Q has columns comes within a
-third of its error, if half the fragments are drawn by their leverage in Q and half evenly, each
-weighted by its chance (Drineas, Mahoney & Muthukrishnan 2006; a uniform draw errs up to ten times
-as much on tables outside the training set).
-(Projecting rho on an orthonormal basis of cell space instead errs by tens of percent.)
+the frames. Q are the leading left singular vectors of W M Sigma. The three colours of a map light a
+shape much alike, so one Q serves them all: 96 columns have less than three times the error of 64,
+and a frame reads them once. The frame is Q (C rho), with a C for each colour.
 
-*Error.* Some fragments, drawn evenly from all that are shown, keep their exact rows, built at twice
-the resolution, shadows too: comparing them gives every frame its measured error. (Drawing them from
-outside the fit alone would overstate the error of small parts, of which the fit holds most.)
+*Fit.* The orthogonal choice C = Q^T W needs every row of W. Weighted least squares on some five
+times more rows than Q has columns comes within a third of its error, if half of the fragments are
+drawn by their leverage scores in Q and half evenly, each weighted by its chance (Drineas, Mahoney &
+Muthukrishnan 2006). A uniform draw has up to ten times the error on tables outside the training
+set. (Projecting rho on an orthonormal basis of cell space instead errs by tens of percent.)
+
+*Error.* Some fragments, the probes, are drawn evenly from all that are shown. They keep their exact
+rows, built at twice the resolution, shadows too; comparing with them gives every frame its measured
+error. (Probes from outside the fit alone would overstate the error of small parts, most of whose
+fragments are in the fit.)
 
 References
 ----------
@@ -27,7 +29,7 @@ Transactions on Graphics 25(3), 2006.
 P. Drineas, M. Mahoney, S. Muthukrishnan, "Sampling algorithms for l2 regression and applications",
 SODA 2006: rows drawn by leverage.
 M. Hasan, F. Pellacini, K. Bala, "Matrix row-column sampling for the many-light problem", ACM
-Transactions on Graphics 26(3), 2007: few rows of a transport matrix tell of all.
+Transactions on Graphics 26(3), 2007: a few rows of a transport matrix represent all.
 """
 
 from __future__ import annotations
@@ -52,7 +54,6 @@ from traitbrdf.transport.basis import (
     Basis,
     Training,
     damping_of,
-    eigh,
     extended,
     leading,
     per_colour,
@@ -68,32 +69,49 @@ Int64 = NDArray[np.int64]
 
 @dataclass
 class _Part:
-    """One part's share of its group's basis."""
+    """One part's share of its group's basis.
+
+    Attributes
+    ----------
+    group : int, index of the basis
+    span : slice of the group's fragments
+    pixels : (P,) tensor, flat pixel index of each fragment; none occurs twice
+    mirror : (P, 3) tensor, radiance that a perfect mirror shows
+    probes : (C, m) tensor, fragments of the part that keep exact rows, for each colour
+    exact : slice, where these rows are among the group's
+    """
 
     group: int
-    span: slice  # of the group's fragments
-    pixels: torch.Tensor  # (P,) flat pixel index of each fragment, each at most once
-    mirror: torch.Tensor  # (P, 3) what a perfect mirror shows
-    probes: torch.Tensor  # (C, m) fragments of the part that keep exact rows, for each colour
-    exact: slice  # where these rows are among the group's
+    span: slice
+    pixels: torch.Tensor
+    mirror: torch.Tensor
+    probes: torch.Tensor
+    exact: slice
 
 
 @dataclass(frozen=True)
 class PartFrame:
-    """One part's shading of one table, and its measured error."""
+    """One part shaded with one table, and its measured error.
 
-    radiance: torch.Tensor  # (P, 3)
-    deviation: float  # mean |I - I_exact| over the part's probes
-    level: float  # mean I_exact over the part's probes
+    Attributes
+    ----------
+    radiance : (P, 3) tensor, linear radiance of the part's fragments
+    deviation : float, mean |I - I_exact| over the part's probes
+    level : float, mean I_exact over the part's probes
+    """
+
+    radiance: torch.Tensor
+    deviation: float
+    level: float
 
     @property
     def error(self) -> float:
-        """Mean relative L1 of the part, 0 where it is black."""
+        """Mean relative L1 of the part; the deviation itself where the level is 0."""
         return self.deviation / self.level if self.level > 0.0 else self.deviation
 
 
 class Transport:
-    """The compressed operator of a scene: `shade` turns a table into a part's fragments.
+    """The compressed operator of a scene: `shade` turns a table into the radiance of a part.
 
     Parameters
     ----------
@@ -101,30 +119,34 @@ class Transport:
     grid : HalfDiffGrid
         The grid of the tables to be shown.
     training : Training
-        What the basis is fitted to: see `training_tables`.
+        Tables that the bases are fitted to (see `training_tables`), and parts that keep their
+        material.
     rank : int
-        At most so many basis images for a group of parts.
+        Most basis images of a group of parts.
     resolution : float
         As for `Operator`.
     seed : int
-        Chooses the subset and the probes.
-    device : torch device of the frames
-    progress : called with (stage, fraction); may raise to cancel
-    fixed : tables (grid.size, 3) by index into ``scene.parts``
-        Parts that keep their material. A group of nothing else is prepared for these tables alone,
-        which takes a fraction of the time; `freed` prepares it for all others.
+        Chooses the subset, the rows of the fit and the probes.
+    device : str or torch.device
+        Where frames are computed.
+    progress : called with (stage, fraction done); may raise to cancel
+
+    Raises
+    ------
+    ValueError
+        If the rank, the training tables or the tables of fixed parts do not fit.
     """
 
     TRAINING_ROWS = 320
-    """Fragments of a group (S) on which the training tables are compared."""
+    """Fragments in S, the subset of a group on which training tables are combined."""
     TABLES = 5 / 6
-    """Combinations of training tables for each basis image: their colours make up the rest."""
+    """Combinations of training tables for each basis image; each has images in three colours."""
     FIT_FACTOR = 8
     """Rows of the least-squares fit for each basis image."""
     PROBES = 20
-    """Fragments of a part and colour that are kept exact, to measure errors."""
+    """Fragments of a part that keep exact rows, for each colour, to measure errors."""
     ENOUGH = 1e-6
-    """Basis images that carry less of the training images than this are left out."""
+    """Basis images whose singular value is less than this share of the largest are left out."""
 
     def __init__(
         self,
@@ -136,29 +158,36 @@ class Transport:
         seed: int = 0,
         device: str | torch.device = "cpu",
         progress: Progress | None = None,
-        fixed: Mapping[int, Float32] | None = None,
     ) -> None:
         if not isinstance(rank, int) or rank < 1:
             raise ValueError(f"rank: expected a positive integer, got {rank!r}")
-        for part, table in (fixed or {}).items():
+        for part, table in training.fixed.items():
             if not 0 <= part < len(scene.parts) or table.shape != (grid.size, 3):
                 raise ValueError(
                     f"fixed: expected tables ({grid.size}, 3) of {len(scene.parts)} parts, got "
                     f"{table.shape} for part {part}"
                 )
         self._begin(scene, grid, rank, resolution, device)
-        self._compress_groups(training, fixed or {}, {}, seed, progress)
+        self._compress_groups(training, {}, seed, progress)
 
     def freed(
         self, training: Training, seed: int = 0, progress: Progress | None = None
     ) -> Transport:
-        """What a transport of these settings without fixed parts would be.
+        """Return a transport that can show any material on the fixed parts, too.
 
-        The bases of the other parts are shared, not computed again. This transport stays as it is.
+        It shares the bases of groups without fixed parts. This transport does not change.
+
+        Parameters
+        ----------
+        training : Training
+            Its `fixed` is ignored.
+        seed : int
+            As for this transport.
+        progress : called with (stage, fraction done); may raise to cancel
         """
         other = Transport.__new__(Transport)
         other._begin(self.scene, self.grid, self.rank, self.resolution, self.device)
-        if self._operator is not None:  # its own: this one may be in use
+        if self._operator is not None:  # its own operator, since this one may be in use
             tree = self._operator.tree
             other._operator = Operator(self.scene, self.grid, self.resolution, tree)
         known = {
@@ -169,12 +198,14 @@ class Transport:
         for part in range(len(self.parts)):
             if part not in self.fixed:
                 other.parts[part] = self.parts[part]
-        other._compress_groups(training, {}, known, seed, progress)
+        other._compress_groups(replace(training, fixed={}), known, seed, progress)
         return other
 
     def truncated(self, rank: int) -> Transport:
-        """This transport with at most the first `rank` images of each basis: faster, and less
-        exact. This one stays as it is."""
+        """Return a faster, less exact transport: at most the first `rank` images of each basis.
+
+        This transport does not change.
+        """
         other = copy.copy(self)
         other.rank = min(rank, self.rank)
         other.parts, other._projected = list(self.parts), ()
@@ -189,15 +220,15 @@ class Transport:
         return other
 
     def stored(self, dtype: torch.dtype) -> Transport:
-        """This transport with its basis images kept as `dtype`: float32, float16 or bfloat16.
+        """Return a transport whose basis images are float32, float16 or bfloat16.
 
-        Half the memory, and errors of rounding that frames measure like all others; sums stay in
-        float32. This one stays as it is.
+        The 16-bit types take half the memory. Frames measure the errors of rounding like all other
+        errors; sums stay in float32. This transport does not change.
 
         Raises
         ------
         ValueError
-            If it is another type.
+            If `dtype` is another type.
         """
         if dtype not in TOP:
             raise ValueError(f"dtype: expected float32, float16 or bfloat16, got {dtype}")
@@ -209,16 +240,17 @@ class Transport:
 
     @property
     def rank_used(self) -> int:
-        """The most images of any basis."""
+        """Largest number of images of any basis."""
         return max((basis.rank for basis in self.bases), default=0)
 
     def probed(self, tables: torch.Tensor, ranks: Sequence[int]) -> tuple[Float64, Float64]:
-        """What frames of `truncated` would differ by on the probes, and what these show.
+        """Measure the errors of `truncated` transports on the probes.
 
         Parameters
         ----------
-        tables : (len(cells), 3, T) float32, each on all parts
-        ranks : numbers of images
+        tables : (len(cells), 3, T) float32
+            Tables, each shown on all parts.
+        ranks : numbers of basis images
 
         Returns
         -------
@@ -251,12 +283,11 @@ class Transport:
     def _compress_groups(
         self,
         training: Training,
-        fixed: Mapping[int, Float32],
         known: Mapping[int, Basis],
         seed: int,
         progress: Progress | None,
     ) -> None:
-        """The bases of all groups; those that are `known`, by group, are taken as they are."""
+        """Compute the bases of all groups but those that are `known`, by group."""
         shape = training.tables.shape
         if shape != (self.grid.size, len(training.weight)) or not len(training.weight):
             raise ValueError(
@@ -266,7 +297,7 @@ class Transport:
         report = progress or (lambda stage, fraction: None)
         tables = torch.from_numpy(np.ascontiguousarray(training.tables))
         importance = torch.from_numpy(training.weight)
-        groups = self._groups()
+        groups, fixed = self._groups(), training.fixed
         # the next part's rays are cast while others are shaded
         cancelled, operator = threading.Event(), self.operator
 
@@ -303,14 +334,16 @@ class Transport:
         self._join_cells()
 
     def _groups(self) -> list[range]:
-        """Parts that share a basis: those of the shape, which are often made of one material and
-        mostly look alike; and the ground, which does not."""
+        """Return the groups of parts that share a basis: the parts of the shape, and the ground.
+
+        The parts of a shape often have one material, and mostly look alike.
+        """
         count = len(self.scene.shape.parts)
         groups = [range(count), range(count, len(self.scene.parts))]
         return [group for group in groups if len(self._fragments(group))]
 
     def _fragments(self, group: range) -> range:
-        """The fragments of a group of parts."""
+        """Return the fragments of a group of parts."""
         spans = [self.scene.part_slice(part) for part in group]
         return range(spans[0].start, spans[-1].stop) if spans else range(0)
 
@@ -322,15 +355,16 @@ class Transport:
         resolution: float,
         device: str | torch.device,
     ) -> None:
+        """Set the attributes of a transport without bases."""
         self.scene = scene
         self.grid = grid
         self.rank = rank
         self.resolution = resolution
         self.device = torch.device(device)
-        self.grey = _is_grey(scene)
+        self.grey = is_grey(scene)
         """Whether all light is grey, so that one channel of the basis serves all three."""
         self.dtype = torch.float32
-        """What the basis images are kept in: see `stored`."""
+        """Type of the basis images; see `stored`."""
         self.fixed: frozenset[int] = frozenset()
         """Parts that were prepared for one material alone."""
         self.bases: list[Basis] = []
@@ -367,8 +401,17 @@ class Transport:
         casting: Mapping[int, concurrent.futures.Future[None]],
         report: Progress,
     ) -> Basis:
-        """The basis of a group from its images under the tables `mix` (cells, R), of which
-        `need` (R,) is the weight."""
+        """Compute the basis of a group of parts.
+
+        Parameters
+        ----------
+        group : range of parts
+        mix : (cells, R) tables whose images span the frames
+        need : (R,) weights of these images
+        rng : draws the probes and the rows of the fit
+        casting : the task that casts each part's rays
+        report : called with (stage, fraction done)
+        """
         scene, operator = self.scene, self.operator
         fragments = self._fragments(group)
         colours = 1 if self.grey else 3
@@ -410,7 +453,7 @@ class Transport:
         return self._assemble(group, basis, damping, np.concatenate(exact, axis=1), rng)
 
     def _subset(self, group: range, rng: np.random.Generator) -> Int64:
-        """S: fragments of all parts, of small ones more than their share."""
+        """Draw the fragments S from all parts, from small ones more than their share."""
         spans = [self.scene.part_slice(part) for part in group]
         sizes = np.array([span.stop - span.start for span in spans])
         share = np.sqrt(sizes) / np.sqrt(sizes).sum()
@@ -421,7 +464,7 @@ class Transport:
         return np.sort(np.concatenate(chosen))
 
     def _probe_rows(self, probes: Int64) -> Float32:
-        """(C, m, cells) exact rows of fragments (C, m), each of one colour."""
+        """Compute the exact rows (C, m, cells) of fragments (C, m), each in one colour."""
         distinct, where = np.unique(probes, return_inverse=True)
         rows = self._exact.rows(distinct)
         return np.stack([rows[at, c] for c, at in enumerate(where.reshape(probes.shape))])
@@ -433,11 +476,11 @@ class Transport:
         importance: torch.Tensor,
         rng: np.random.Generator,
     ) -> tuple[Float32, Float64]:
-        """M = X Y Sigma^-1 (cells, R), from the rows of a group's subset, and Sigma (R,).
+        """Compute M = X Y Sigma^-1 (cells, R) and Sigma (R,) from the rows of a group's subset.
 
-        One M serves the three colours, whose images differ: R is less than the rank.
+        One M serves the three colours, whose images differ; so R is less than the rank.
         """
-        # an operator of its own: what rays are cast must not depend on what other threads know
+        # an operator of its own: results must not depend on which rays other threads have cast
         scout = Operator(self.scene, self.grid, self.resolution, self.operator.tree)
         rows = scout.rows(self._subset(group, rng))
         colours = 1 if self.grey else 3
@@ -447,8 +490,8 @@ class Transport:
         lit = scale > 0.0
         weight = torch.where(lit, importance / torch.where(lit, scale, 1.0), 0.0)
         images = images * weight
-        # eigenvectors of the small Gram matrix: an SVD crawls where singular values underflow
-        squares, u = eigh(images @ images.T)
+        # eigenvectors of the small Gram matrix: an SVD is slow where singular values underflow
+        squares, u = torch.linalg.eigh(images @ images.T)
         count = min(self.rank if self.grey else math.ceil(self.TABLES * self.rank), len(squares))
         enough = squares.flip(0) > (0.1 * self.ENOUGH) ** 2 * squares[-1]
         count = max(1, min(count, int(enough.sum())))
@@ -467,13 +510,13 @@ class Transport:
         exact: Float32,
         rng: np.random.Generator,
     ) -> Basis:
-        """The group's C by weighted least squares, and everything a frame reads."""
+        """Fit the group's C by weighted least squares, and collect all that a frame reads."""
         fragments = self._fragments(group)
         chosen, importance = self._fit_rows(basis, len(fragments), rng)
         weight = torch.from_numpy(importance)
         at = torch.from_numpy(chosen)
         sampled = basis[at].double() * weight[:, None]
-        squares, vectors = eigh(sampled.T @ sampled)
+        squares, vectors = torch.linalg.eigh(sampled.T @ sampled)
         keep = squares > 1e-9 * squares[-1].clamp_min(1e-30)
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale) @ vectors.T
@@ -483,7 +526,7 @@ class Transport:
         seen = (rows != 0.0).any(dim=0).any(dim=0)
         for i in range(0, len(chosen), 128):
             some = slice(i, i + 128)
-            # of the very operator that made the images: the fit would amplify any difference
+            # from the operator that made the images: the fit would amplify any difference
             shown = torch.from_numpy(self.operator.rows_as_shown(chosen[some] + fragments.start))
             for c in range(len(exact)):
                 rows[c, : solve.shape[0]] += solve[:, some] @ shown[:, c]
@@ -500,7 +543,7 @@ class Transport:
     def _fit_rows(
         self, basis: torch.Tensor, size: int, rng: np.random.Generator
     ) -> tuple[Int64, Float64]:
-        """Fragments and weights of the least-squares fit, drawn half by leverage, half evenly."""
+        """Draw fragments and weights of the fit, half by leverage scores and half evenly."""
         count = self.FIT_FACTOR * max(basis.shape[-1], 8)
         if count >= size:
             return np.arange(size), np.ones(size)
@@ -508,11 +551,11 @@ class Transport:
         chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
         chance /= chance.sum()
         chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)
-        # each speaks for its share of those that were not drawn
+        # a fragment stands for 1 / (expected number of draws) fragments
         return chosen, np.sqrt(times / (count * chance[chosen]))
 
     def _join_cells(self) -> None:
-        """Gather the cells that any part sees: the others are neither decoded nor stored."""
+        """Collect the cells that any part sees; the others are neither decoded nor stored."""
         seen = torch.zeros(self.grid.size, dtype=torch.bool, device=self.device)
         for basis in self.bases:
             seen[basis.cells] = True
@@ -522,7 +565,7 @@ class Transport:
         for basis in self.bases:
             basis.place = place[basis.cells]
             if len(basis.cells) > 0.8 * len(self.cells):
-                # no look-up then, at the price of some zeros
+                # some more zeros in the rows are cheaper than a look-up
                 wide = torch.zeros((*basis.rows.shape[:2], len(self.cells)), device=self.device)
                 wide[:, :, basis.place] = basis.rows
                 basis.rows, basis.place = wide, None
@@ -530,13 +573,20 @@ class Transport:
         self._projected = ()
 
     def train(self, part: int, radiance: torch.Tensor) -> None:
-        """Take an image into a part's basis, so that tables like its own are shown by it.
+        """Extend a part's basis by an image, so that it shows tables like that of the image.
 
         Parameters
         ----------
-        part : index into ``scene.parts``
-        radiance : (P, 3) the part's fragments under some table, without a mirror, as
-            `shade_exactly` has them
+        part : int
+            Index into ``scene.parts``.
+        radiance : (P, 3) tensor
+            Radiance of the part's fragments under some table, as `shade_exactly` returns it
+            without a mirror.
+
+        Raises
+        ------
+        ValueError
+            If the radiance has another shape.
         """
         span = self.scene.part_slice(part)
         if radiance.shape != (span.stop - span.start, 3):
@@ -549,7 +599,7 @@ class Transport:
         known = self.bases[mine.group]
         damping = known.damping.cpu()
         basis = known.basis.cpu().float() * damping[:, None]
-        if self.dtype != torch.float32:  # its columns were scaled
+        if self.dtype != torch.float32:  # `stored` scaled its columns
             basis /= basis.norm(dim=0).clamp_min(1e-30)
         fresh = torch.zeros((len(basis), 3))
         fresh[mine.span] = radiance.cpu() * damping[mine.span, None]
@@ -565,7 +615,7 @@ class Transport:
     # -- files ----------------------------------------------------------------------------------
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that was prepared, as arrays: `restored` makes an equal transport of them."""
+        """Return all that was prepared as arrays; `restored` makes an equal transport of them."""
         known: dict[str, NDArray[Any]] = {
             "rank": np.array(self.rank),
             "resolution": np.array(self.resolution),
@@ -587,8 +637,19 @@ class Transport:
         grid: HalfDiffGrid,
         arrays: Mapping[str, NDArray[Any]],
         device: str | torch.device = "cpu",
+        operator: Operator | None = None,
     ) -> Transport:
-        """The transport of `arrays` for the scene and grid that it was prepared for.
+        """Return the transport of `arrays`.
+
+        Parameters
+        ----------
+        scene, grid : those that the transport was prepared for
+        arrays : what `arrays` returned
+        device : str or torch.device
+            Where frames are computed.
+        operator : Operator or None
+            The uncompressed operator of the same scene, grid and resolution, if there is one:
+            rays that it has cast are not cast again.
 
         Raises
         ------
@@ -600,10 +661,11 @@ class Transport:
         if rank.shape != () or rank.dtype.kind != "i" or resolution.dtype.kind != "f":
             raise ValueError("arrays: expected a rank and a resolution")
         self._begin(scene, grid, int(rank), float(resolution), device)
+        self._operator = operator
         colours = 1 if self.grey else 3
 
         def taken(name: str, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
-            """An array of a shape, -1 for any size."""
+            """Return an array after checking its shape, in which -1 is any size."""
             value = np.asarray(arrays.get(name))
             fits = len(value.shape) == len(shape) and all(
                 want in (-1, got) for want, got in zip(shape, value.shape, strict=False)
@@ -654,18 +716,25 @@ class Transport:
 
     @property
     def bytes(self) -> int:
-        """Size of everything that a frame reads."""
+        """Size in bytes of all that a frame reads."""
         return sum(t.numel() * t.element_size() for b in self.bases for t in (b.basis, b.rows))
 
     # -- frames ---------------------------------------------------------------------------------
 
     def radiance(self, part: int, table: torch.Tensor) -> torch.Tensor:
-        """(P, 3) of a part's fragments, not clamped: linear in `table`, for gradients.
+        """Return the radiance (P, 3) of a part, linear in `table` and not clamped, for gradients.
 
         Parameters
         ----------
-        part : index into ``scene.parts``
-        table : (len(cells), 3) float32 f_r at the cells that the scene sees
+        part : int
+            Index into ``scene.parts``.
+        table : (len(cells), 3) float32
+            f_r in 1/sr at the cells that the scene sees.
+
+        Raises
+        ------
+        ValueError
+            If the table has another shape.
         """
         self._check_table(table)
         known = self.parts[part]
@@ -678,10 +747,11 @@ class Transport:
     def _project(
         self, part: _Part, table: torch.Tensor, alone: bool
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """A table's coefficients (3, r) and a part's exact probes (3, m).
+        """Return a table's coefficients (3, r) and the exact radiance (3, m) of a part's probes.
 
-        One product has those of all parts, and the last is kept: parts of one material follow
-        each other. That of a part that is `alone` reads its own rows only.
+        One product computes them for all parts of the group. The last product is kept, since parts
+        of one material are shaded one after the other. If a part is shaded `alone`, only its own
+        rows are read.
         """
         basis = self.bases[part.group]
         key = (part.group, table._version)
@@ -703,15 +773,23 @@ class Transport:
         mirror: torch.Tensor | None = None,
         alone: bool = False,
     ) -> PartFrame:
-        """Linear radiance of one part's fragments, and its error measured on the probes.
+        """Compute the linear radiance of one part, and its error measured on the probes.
 
         Parameters
         ----------
-        part : index into ``scene.parts``
+        part : int
+            Index into ``scene.parts``.
         table : (len(cells), 3) float32
-            f_r at the cells that the scene sees.
-        mirror : (3,) weight of a perfect mirror
-        alone : whether no other part is shaded with this table next: that reads less memory
+            f_r in 1/sr at the cells that the scene sees.
+        mirror : (3,) tensor or None
+            Weight of a perfect mirror.
+        alone : bool
+            Whether no other part is shaded with this table next; less memory is read then.
+
+        Raises
+        ------
+        ValueError
+            If the table has another shape.
         """
         self._check_table(table)
         known = self.parts[part]
@@ -729,6 +807,7 @@ class Transport:
         return PartFrame(pixels, deviation, level)
 
     def _check_table(self, table: torch.Tensor) -> None:
+        """Raise ValueError unless a table has a value for each cell and colour."""
         if table.shape != (len(self.cells), 3):
             raise ValueError(f"table: expected ({len(self.cells)}, 3), got {tuple(table.shape)}")
 
@@ -739,9 +818,22 @@ class Transport:
         mirror: torch.Tensor | None = None,
         progress: Progress | None = None,
     ) -> PartFrame:
-        """The same by the uncompressed operator: slow, for tables outside the basis.
+        """Compute the same by the uncompressed operator: slow, for tables outside the basis.
 
-        `table` is (grid.size, 3). The error is measured on the probes as well.
+        Parameters
+        ----------
+        part : int
+            Index into ``scene.parts``.
+        table : (grid.size, 3) float32
+            f_r in 1/sr.
+        mirror : (3,) tensor or None
+            Weight of a perfect mirror.
+        progress : called with (stage, fraction done); may raise to cancel
+
+        Raises
+        ------
+        ValueError
+            If the table has another shape.
         """
         if table.shape != (self.grid.size, 3):
             raise ValueError(f"table: expected ({self.grid.size}, 3), got {table.shape}")
@@ -759,7 +851,7 @@ class Transport:
         return PartFrame(radiance, float((found - exact).abs().mean()), float(exact.mean()))
 
     def compose(self, frames: list[PartFrame]) -> torch.Tensor:
-        """The frame (H, W, 3): the parts over the backdrop."""
+        """Combine one frame for each part, and the backdrop, to the frame (H, W, 3)."""
         image = self._backdrop.clone()
         for part, frame in zip(self.parts, frames, strict=True):
             if part is not None:
@@ -767,14 +859,15 @@ class Transport:
         return image.reshape(self.scene.height, self.scene.width, 3)
 
     def frame_error(self, frames: list[PartFrame]) -> float:
-        """Mean relative L1 over the covered pixels, from the parts' probes."""
+        """Return the mean relative L1 over the covered pixels, from the parts' probes."""
         size = [0 if p is None else len(p.pixels) for p in self.parts]
         deviation = sum(n * f.deviation for n, f in zip(size, frames, strict=True))
         level = sum(n * f.level for n, f in zip(size, frames, strict=True))
         return deviation / level if level > 0.0 else deviation
 
 
-def _is_grey(scene: Scene) -> bool:
+def is_grey(scene: Scene) -> bool:
+    """Return whether all light of a scene is grey."""
     image = scene.environment.image
     colours = [np.asarray(c) for light in scene.lights for c in [_colour(light)]]
     same = bool((image[..., 1:] == image[..., :1]).all())
@@ -782,4 +875,5 @@ def _is_grey(scene: Scene) -> bool:
 
 
 def _colour(light: Light) -> tuple[float, float, float]:
+    """Return what sets a light's colour: its intensity or its irradiance."""
     return light.intensity if isinstance(light, PointLight) else light.irradiance

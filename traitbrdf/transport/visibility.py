@@ -1,9 +1,9 @@
-"""What each fragment sees of the light: cuts through the light tree, and masks.
+"""Shared visibility: which nodes of a cut through the light tree each fragment sees.
 
-A cut is one for all fragments, chosen by the light that its nodes carry, as the global cuts of
+All fragments use one cut, chosen by the light that its nodes carry, as the global cuts of
 many-light methods are (Hasan, Pellacini & Bala, "Matrix row-column sampling for the many-light
-problem", ACM Transactions on Graphics 26(3), 2007, take rows and columns of the same matrix of
-lights by pixels); masks of neighbours are shared where they agree.
+problem", ACM Transactions on Graphics 26(3), 2007, sample rows and columns of the same matrix of
+lights by pixels). Neighbouring fragments share their visibility masks where these agree.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,28 +28,28 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the fraction done; may raise to cancel."""
+"""Called with the stage of the work and the fraction done; may raise to cancel."""
 
 _SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
-"""How much less a part may bend than `_BEND` for far images to begin nearer."""
+"""Factors on `_BEND`: a part that bends this much less interpolates that much narrower lobes."""
 
 _KEPT = 0.9
-"""Share of the fragments with interpolated far images that must remain so at such a scale."""
+"""Least share of the interpolated fragments that must remain interpolated at such a scale."""
 
 _LEVELS = (4, 2)
 """Spacing in pixels of the lattices on which far images are computed."""
 
 _BEND = (0.003, 0.06)
-"""Most that a half vector departs, seen against the normal, from those of its cell's corners:
-from their mean, and from any."""
+"""Greatest distance of a half vector, relative to the normal, from those of its cell's corners:
+from their mean, and from each."""
 
 _UNEVEN = 0.005
-"""Most that a cell's corners differ in what light they see: see `disagreement`."""
+"""Greatest disagreement of a cell's corners about the light that they see; see `disagreement`."""
 
 
 @dataclass(frozen=True)
 class VisibilityCut:
-    """Nodes of a light tree whose visibility is one bit each.
+    """A cut through the light tree: the visibility of each of its nodes is one bit.
 
     Attributes
     ----------
@@ -68,7 +68,16 @@ class VisibilityCut:
 
     @classmethod
     def build(cls, tree: LightTree, spacing: float, share: float) -> VisibilityCut:
-        """Cut where nodes are no wider than `spacing` and hold no more than `share` of the flux."""
+        """Build the cut whose nodes are small and carry little light.
+
+        Parameters
+        ----------
+        tree : LightTree
+        spacing : float
+            Greatest radius of a node, in radians.
+        share : float
+            Greatest share of all flux in a node. Leaves of the tree may exceed both.
+        """
         flux = tree.flux
         whole = (tree.child < 0).all(axis=1)
         total = max(float(flux[whole].sum()), 1e-300)
@@ -83,58 +92,68 @@ class VisibilityCut:
         return cls(first, last, directions, flux[cut] / total, neighbours)
 
 
-@dataclass(frozen=True)
-class Bundles:
-    """Samples in groups that share one walk, and groups in bundles that one thread shades.
+class Bundles(NamedTuple):
+    """Samples in groups that share one walk, and groups in bundles that are shaded together.
 
-    `target` says which fragment a sample belongs to: all its samples are in one bundle.
+    All samples of a fragment are in one bundle.
+
+    Attributes
+    ----------
+    bundle_start : (B + 1,) int64, where bundles start among the groups
+    group_start : (G + 1,) int64, where groups start among the samples
+    target : (n,) int64, the fragment that each sample belongs to
+    normals, views : (n, 3) float32 unit vectors in the map's frame
+    share : (n,) float32, of each sample in its fragment
+    sample : (n,) int64, indices of the samples in the scene
+    middle_normals, middle_views : (G, 3) float32, means of the groups
+    spread : (G,) float32
+        How far half vectors against the normals differ within each group, in radians.
+    masks : (G, 4) int32 visibility rows, -1 for none
+    several : (G,) bool, whether the fragment has other groups
     """
 
-    bundle_start: Int64  # (B + 1,) into groups
-    group_start: Int64  # (G + 1,) into samples
-    target: Int64  # (n,)
-    normals: Float32  # (n, 3)
-    views: Float32  # (n, 3)
-    share: Float32  # (n,)
-    sample: Int64  # (n,) in the scene
-    middle_normals: Float32  # (G, 3)
-    middle_views: Float32  # (G, 3)
-    spread: Float32  # (G,) how far half vectors against the normals differ within the group
-    masks: NDArray[np.int32]  # (G, 4)
-    several: NDArray[np.bool_]  # (G,) whether the fragment has other groups
-
-    _PER_SAMPLE: ClassVar = ("normals", "views", "share", "sample")
-
-    def for_the_walk(self) -> tuple[Any, ...]:
-        return (
-            self.bundle_start, self.group_start, self.target, self.normals, self.views, self.share,
-            self.middle_normals, self.middle_views, self.spread, self.masks, self.several,
-        )  # fmt: skip
+    bundle_start: Int64
+    group_start: Int64
+    target: Int64
+    normals: Float32
+    views: Float32
+    share: Float32
+    sample: Int64
+    middle_normals: Float32
+    middle_views: Float32
+    spread: Float32
+    masks: NDArray[np.int32]
+    several: NDArray[np.bool_]
 
     def of(self, place: Int64) -> Bundles:
-        """The samples of some fragments alone, in their groups; `place` renumbers the fragments,
-        and those of -1 are left out."""
+        """Return the samples of some fragments alone, in their groups.
+
+        Parameters
+        ----------
+        place : (fragments,) int64
+            The new number of each fragment; those of -1 are left out.
+        """
         target = place[self.target]
-        left = np.concatenate([[0], np.cumsum(target >= 0)])[self.group_start]
-        kept = replace(
-            self, group_start=left, target=target[target >= 0],
-            **{name: getattr(self, name)[target >= 0] for name in self._PER_SAMPLE},
-        )  # fmt: skip
-        return kept.take(np.diff(left) > 0)
+        kept = target >= 0
+        left = np.concatenate([[0], np.cumsum(kept)])[self.group_start]
+        return self._replace(
+            group_start=left, target=target[kept], normals=self.normals[kept],
+            views=self.views[kept], share=self.share[kept], sample=self.sample[kept],
+        ).take(np.diff(left) > 0)  # fmt: skip
 
     def separated(self) -> Bundles:
-        """Each sample in a group of its own."""
+        """Return each sample in a group of its own."""
         size = np.diff(self.group_start)
         starts = np.arange(len(self.target) + 1)
-        return replace(
-            self, bundle_start=self.group_start[self.bundle_start], group_start=starts,
+        return self._replace(
+            bundle_start=self.group_start[self.bundle_start], group_start=starts,
             middle_normals=self.normals, middle_views=self.views,
             spread=np.zeros(len(self.target), np.float32),
             masks=np.repeat(self.masks, size, axis=0), several=np.repeat(self.several, size),
         )  # fmt: skip
 
     def take(self, groups: NDArray[np.bool_]) -> Bundles:
-        """These groups alone."""
+        """Return the groups of a mask (G,) alone."""
         kept = np.flatnonzero(groups)
         samples, group_start = expand(self.group_start, kept)
         bundle = np.repeat(np.arange(len(self.bundle_start) - 1), np.diff(self.bundle_start))[kept]
@@ -148,7 +167,20 @@ class Bundles:
 
 
 def expand(starts: Int64, chosen: Int64) -> tuple[Int64, Int64]:
-    """Members of the `chosen` sets of a list in sets, and where the new sets start."""
+    """Select some sets of a list that is divided into sets.
+
+    Parameters
+    ----------
+    starts : (sets + 1,) int64
+        Set k holds the members `starts[k]` to `starts[k + 1] - 1`.
+    chosen : (m,) int64
+        Sets to select.
+
+    Returns
+    -------
+    members : (n,) int64 members of the chosen sets, one set after the other
+    new : (m + 1,) int64 where these sets start among `members`
+    """
     size = np.diff(starts)[chosen]
     new = np.concatenate([[0], np.cumsum(size)])
     members = np.arange(new[-1]) - np.repeat(new[:-1] - starts[chosen], size)
@@ -164,7 +196,25 @@ def alike_masks(
     masks: NDArray[np.int32],
     limit: float,
 ) -> NDArray[np.bool_]:
-    """Whether the members of each set see the light nearly alike and share their masks."""
+    """Return whether the members of each set can share one walk of the light tree.
+
+    They can if their half vectors nearly agree, they lie on one sheet of the surface, and their
+    visibility masks are the same.
+
+    Parameters
+    ----------
+    edge, size : (sets,) int64
+        First member of each set, and its number of members.
+    normals, views : (n, 3) float32 unit vectors of the members
+    positions : (n, 3) float64
+    masks : (n, 4) int32 visibility rows, -1 for none
+    limit : float
+        How far half vectors may differ, in radians.
+
+    Returns
+    -------
+    (sets,) bool
+    """
     whose = np.repeat(np.arange(len(edge)), size)
 
     def away(values: NDArray[Any]) -> tuple[Float64, Float64]:
@@ -188,7 +238,19 @@ def alike_masks(
 def centres(
     group_start: Int64, normals: Float32, views: Float32
 ) -> tuple[Float32, Float32, Float32]:
-    """Mean unit normals and views of groups, and how far their members' half vectors depart."""
+    """Average the normals and views of groups of samples.
+
+    Parameters
+    ----------
+    group_start : (G + 1,) int64 where groups start among the samples
+    normals, views : (n, 3) float32 unit vectors of the samples
+
+    Returns
+    -------
+    normals, views : (G, 3) float32 mean unit vectors
+    spread : (G,) float32
+        How far the half vectors of the members depart from that of the means, in radians.
+    """
     size = np.diff(group_start)
     means = []
     off = np.zeros(len(normals))
@@ -203,13 +265,22 @@ def centres(
 
 
 def first_rows(group_start: Int64, masks: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The mask rows of each group: those of any member that has some."""
+    """Return the mask rows (G, 4) of groups, from those (n, 4) of their members.
+
+    All members of a group that have masks have the same.
+    """
     rows: NDArray[np.int32] = np.maximum.reduceat(masks, group_start[:-1], axis=0)
     return rows
 
 
 def questions(ask: Float32, asked: Int64) -> tuple[Float64, tuple[Int64, Int64]]:
-    """Unit directions of all questions, and (sample, question) of each."""
+    """Return the unit directions of all questions, and the group and number of each.
+
+    Parameters
+    ----------
+    ask : (groups, most, 3) float32 directions
+    asked : (groups,) int64 number of each group's questions
+    """
     sample, question = np.nonzero(np.arange(ask.shape[1]) < asked[:, None])
     toward = ask[sample, question].astype(np.float64)
     toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
@@ -217,17 +288,32 @@ def questions(ask: Float32, asked: Int64) -> tuple[Float64, tuple[Int64, Int64]]
 
 
 class Visibility:
-    """One bit for every node of the cut, at the fragments where rays were cast."""
+    """Visibility of the nodes of a cut, one bit each, at fragments where rays were cast.
+
+    Parameters
+    ----------
+    scene : Scene
+    cut : VisibilityCut
+    middle : (fragments,) int64
+        The sample that stands for each fragment.
+
+    Attributes
+    ----------
+    toward : (D, 3) float64 unit world directions towards the nodes
+    row_of : (fragments,) int32 row of each fragment, -1 for none
+    row_of_sample : (samples,) int32 row of each sample that has one of its own, -1 for none
+    rows : int, number of rows
+    """
 
     def __init__(self, scene: Scene, cut: VisibilityCut, middle: Int64) -> None:
         self.scene = scene
         self.cut = cut
         self.toward = turn_about_y(cut.directions, scene.environment.rotation)
         self.row_of = np.full(len(scene.pixels), -1, np.int32)
-        # of samples with rays of their own: a fragment at a border lies on either side of an edge
+        # a fragment at a border has samples on both sides of an edge: each has its own row
         self.row_of_sample = np.full(len(scene.normals), -1, np.int32)
         self.rows = 0
-        self._sharp = cut.share > 0.02  # suns, that cast sharp shadows
+        self._sharp = cut.share > 0.02  # suns, which cast sharp shadows
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
         self._middle = middle
         self._bits = np.zeros((0, len(cut.share)), np.uint8)
@@ -236,22 +322,29 @@ class Visibility:
 
     @property
     def bits(self) -> NDArray[np.uint8]:
-        """(rows, D): 0 hidden, 1 visible, 2 below the horizon."""
+        """Bits (rows, D): 0 hidden, 1 visible, 2 below the horizon."""
         return self._bits[: self.rows]
 
     @property
     def masks(self) -> tuple[NDArray[np.uint64], ...]:
-        """Sets (rows, words) of nodes, 64 a word, that are: hidden; not surely visible; not
-        surely hidden. Sure is a node whose neighbours on the sphere agree with it."""
+        """The arrays `hidden`, `unseen` and `unhidden` of `arrays.VisibilityMasks`."""
         return self._masks
 
     def cast(
         self, index: Int64, around: NDArray[np.int32], least: int, verify: bool = False
     ) -> None:
-        """Find the bits of fragments `index` (m,), with rays where the `around` (m, 4) disagree.
+        """Find the bits of fragments, with rays where the rows around them disagree.
 
-        Fewer than `least` rows around, and every node above the horizon gets a ray. `verify` casts
-        an eighth of what they agree on, and all of it where that proves them wrong.
+        Parameters
+        ----------
+        index : (m,) int64 fragments
+        around : (m, 4) int32
+            Rows of fragments nearby, -1 for none.
+        least : int
+            With fewer rows around, every node above the horizon gets a ray.
+        verify : bool
+            Cast an eighth of the rays on which the rows around agree, and all rays of a fragment
+            where one of these proves them wrong.
         """
         normals = self.scene.normals[self._middle[index]]
         for i in range(0, len(index), 2048):
@@ -269,10 +362,14 @@ class Visibility:
                 self.row_of[index[some]] = self._append(bits)
 
     def cast_samples(self, index: Int64, fine: bool) -> None:
-        """Bits of every sample of those of the fragments `index` that have several.
+        """Find the bits of every sample of fragments that have several samples.
 
-        The first and the last get rays; where these and the middle one agree, so do the others,
-        unless all shall have them (`fine`).
+        Parameters
+        ----------
+        index : (m,) int64 fragments
+        fine : bool
+            Cast rays for every sample. If False, a sample between the first, the middle and the
+            last takes the bits on which these three agree.
         """
         offsets = self.scene.offsets
         count = np.diff(offsets)[index]
@@ -292,7 +389,7 @@ class Visibility:
         self._cast_samples(samples, np.repeat(around, np.diff(starts), axis=0))
 
     def _cast_samples(self, samples: Int64, around: NDArray[np.int32]) -> None:
-        """Bits of those samples that have none, with rays where the rows `around` disagree."""
+        """Find the bits of samples that have none, with rays where the rows `around` disagree."""
         new = self.row_of_sample[samples] < 0
         samples, around = samples[new], around[new]
         for i in range(0, len(samples), 2048):
@@ -307,7 +404,7 @@ class Visibility:
                 self.row_of_sample[chosen] = self._append(bits)
 
     def _append(self, bits: NDArray[np.uint8]) -> Int64:
-        """Keep rows of bits; returns their numbers."""
+        """Append rows of bits, and return their numbers."""
         need = self.rows + len(bits)
         if need > len(self._bits):
             size = max(need, len(self._bits) * 5 // 4)
@@ -320,12 +417,13 @@ class Visibility:
         return np.arange(rows.start, rows.stop)
 
     def _ray(self, bits: NDArray[np.uint8], sample: Int64) -> None:
-        """Fill the bits that are 3 by rays from the samples (m,)."""
+        """Replace the bits that are 3 by casting rays from the samples (m,)."""
         at, node = np.nonzero(bits == 3)
         bits[at, node] = self.scene.visible(sample[at], self.toward[node])
 
 
 def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
+    """Return a copy of an array with zeros up to `size` rows."""
     larger = np.zeros((size, array.shape[1]), array.dtype)
     larger[: len(array)] = array
     return larger
@@ -333,16 +431,21 @@ def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a part's far images are computed, and how the others follow; indices in the part.
+    """Where a part's far images are computed, and how the others are interpolated from these.
 
     Attributes
     ----------
-    computed : (K,) fragments whose far images are computed
-    corners : (P, 4) int32 indices into `computed`
+    computed : (K,) int64
+        Fragments whose far images are computed, counted within the part.
+    corners : (P, 4) int32
+        For each fragment, the indices into `computed` that it is interpolated from.
     weights : (P, 4) float32
+        Weights of the corners.
     mask_rows : (P, 4) int32 visibility rows around each fragment, -1 for none
-    scale : of `_SPLIT` and `_BEND`
-    grazing : the largest angle of a view from its normal, in radians
+    scale : float
+        Factor on `_BEND`, and on the theta_h where far images begin; 1 or less.
+    grazing : float
+        Largest angle of a view from its normal, in radians.
     """
 
     computed: Int64
@@ -362,6 +465,21 @@ class Plan:
         fine: bool,
         report: Progress,
     ) -> Plan:
+        """Cast a part's shadow rays, and choose the fragments whose far images are computed.
+
+        Parameters
+        ----------
+        scene : Scene
+        part : int
+            Index into ``scene.parts``.
+        visibility : Visibility or None
+            Where rays are kept; None where nothing casts shadows.
+        loose : float
+            Factor on the tolerances of interpolation, from 1.
+        fine : bool
+            Whether every sample at a border casts its own rays.
+        report : called with (stage, fraction done)
+        """
         span = scene.part_slice(part)
         count = span.stop - span.start
         casts = visibility if scene.casts[part] else None
@@ -421,7 +539,7 @@ class Plan:
             if casts is not None:
                 ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
             good = open_[ok]
-            # a missing corner weighs nothing: any other stands for it
+            # a missing corner has no weight: any other index will do
             some = np.take_along_axis(found, (found >= 0).argmax(axis=1)[:, None], axis=1)
             corners[good] = np.where(found >= 0, found, some)[ok]
             weights[good] = weight[ok]
@@ -457,7 +575,7 @@ class Plan:
 
 
 class _Lattice:
-    """Fragments of one part by pixel, and the cells of square lattices around them."""
+    """The fragments of one part by pixel, and the cells of square lattices around them."""
 
     def __init__(
         self,
@@ -471,21 +589,22 @@ class _Lattice:
     ) -> None:
         self._x, self._y, self._single = x, y, single
         self._positions, self._normals = positions, normals
-        # a margin on the far sides spares the tests at the frame's edge
+        # a margin at the right and at the bottom spares tests at the frame's edge
         margin = 32
         self._at = np.full((height + margin, width + margin), -1, np.int64)
         inside = np.flatnonzero(single)
         self._at[y[inside], x[inside]] = inside
 
     def on(self, spacing: int) -> Int64:
-        """Fragments that are points of the lattice."""
+        """Return the fragments that are points of the lattice."""
         mask = self._single & (self._x % spacing == 0) & (self._y % spacing == 0)
         return np.flatnonzero(mask)
 
     def cell(self, some: Int64, spacing: int) -> tuple[Int64, Float64]:
-        """Corners (m, 4) of the cells of fragments `some`, -1 where missing, and their weights.
+        """Return the corners (m, 4) of the cells of fragments, -1 where missing, and their weights.
 
-        Bilinear; a plane through three where one is missing; zero where more are.
+        Weights are bilinear. Where one corner is missing they are those of the plane through the
+        other three; where more are missing and would count, they are zero.
         """
         x0, y0 = self._x[some] // spacing * spacing, self._y[some] // spacing * spacing
         u = (self._x[some] - x0) / spacing
@@ -516,8 +635,11 @@ class _Lattice:
 def _departure(
     bend: Float64, some: Int64, corners: Int64, weights: Float64
 ) -> tuple[Float64, Float64]:
-    """How far `bend` of fragments `some` (m,) is from their cells' corners: from the mean, and from
-    any."""
+    """Return how far `bend` at fragments `some` (m,) is from that at their cells' corners.
+
+    The first array is the distance from the interpolated value, the second the greatest distance
+    from a corner.
+    """
     at = np.where(corners >= 0, corners, some[:, None])
     around, own = bend[at], bend[some]
     off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
@@ -525,7 +647,7 @@ def _departure(
 
 
 def _predictable(off: Float64, spread: Float64, loose: float) -> NDArray[np.bool_]:
-    """Whether half vectors vary so linearly over a cell that images of wide lobes do."""
+    """Return whether half vectors vary linearly enough over a cell to interpolate wide lobes."""
     answer: NDArray[np.bool_] = (off < loose * _BEND[0]) & (spread < loose * _BEND[1])
     return answer
 
@@ -533,7 +655,10 @@ def _predictable(off: Float64, spread: Float64, loose: float) -> NDArray[np.bool
 def _sharp_bits(
     scene: Scene, span: slice, visibility: Visibility | None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]] | None:
-    """Cut nodes that outshine all others, and whether each fragment sees them, a ray for each."""
+    """Find the brightest nodes of the cut, and cast a ray to each from every fragment of a part.
+
+    Returns the nodes (k,) and whether each fragment sees them (P, k), or None if no node is bright.
+    """
     if visibility is None:
         return None
     nodes = np.argsort(-visibility.cut.share)[:4]
@@ -558,7 +683,7 @@ def _shadows_agree(
     sharp: tuple[NDArray[np.int64], NDArray[np.bool_]] | None,
     loose: float,
 ) -> NDArray[np.bool_]:
-    """Whether the corners of a fragment's cell are lit alike."""
+    """Return whether the corners of each fragment's cell are lit alike."""
     rows = np.where(corners >= 0, visibility.row_of[span][corners], -1).astype(np.int32)
     cells, which = np.unique(rows, axis=0, return_inverse=True)
     first = np.zeros(len(cells), np.int64)
@@ -572,7 +697,7 @@ def _shadows_agree(
     if sharp is not None:
         nodes, own = sharp
         for k, node in enumerate(nodes):
-            bit = np.append(visibility.bits[:, node], np.uint8(2))  # row -1: nothing is known
+            bit = np.append(visibility.bits[:, node], np.uint8(2))  # for row -1: unknown
             # a corner below the light's horizon says nothing about its shadow
             same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
             agree &= same.all(axis=1)
