@@ -326,15 +326,21 @@ class EnvironmentMap:
         n = self.to_map(np.asarray(normals, np.float64))
         flat = n.reshape(-1, 3)
         result = np.zeros(flat.shape)
-        for rows in self._bands():
+        for rows in self.bands():
             moment = texel_moments(self, rows).reshape(-1, 3)
             energy = self.image[rows].reshape(-1, 3).astype(np.float64)
             for i in range(0, len(flat), 64):
                 result[i : i + 64] += np.maximum(flat[i : i + 64] @ moment.T, 0.0) @ energy
         return result.reshape(n.shape)
 
-    def _bands(self, multiple: int = 1) -> Iterator[slice]:
-        """Yield bands of rows of some hundred thousand texels, to limit memory in float64."""
+    def bands(self, multiple: int = 1) -> Iterator[slice]:
+        """Yield bands of rows of some hundred thousand texels, to limit memory in float64.
+
+        Parameters
+        ----------
+        multiple : int
+            The rows of each band but the last are a multiple of it.
+        """
         m, n, _ = self.image.shape
         step = multiple * max((1 << 18) // (n * multiple), 1)
         for start in range(0, m, step):

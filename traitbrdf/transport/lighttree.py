@@ -170,7 +170,7 @@ def _block_light(environment: EnvironmentMap, block: int) -> tuple[Float64, Floa
     m, n = -(-rows // block), -(-columns // block)
     light, shine = np.empty((m, n)), np.empty((m, n, 3, 3))
     right = np.arange(0, columns, block)
-    for band in environment._bands(block):
+    for band in environment.bands(block):
         texel = environment.image[band].astype(np.float64)
         energy = texel.sum(axis=-1) * environment.solid_angles[band, None]
         moment = texel[..., None] * texel_moments(environment, band)[..., None, :]
