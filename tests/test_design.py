@@ -269,6 +269,39 @@ def test_layers_are_changed_later(edit):
     same(edit.material("body").z, edit.traits.move(EMBEDDING.clip(rubber), {"shiny": 0.5}))
 
 
+def test_hidden_layers_are_checked_and_saved(edit, tmp_path):
+    edit.assign("body", "red-rubber")
+    edit.assign("body", "chrome")
+    edit.layers[-1].visible = False
+    with pytest.raises(ValueError, match="'shiny'"):
+        edit.layers[-1].effect = tb.Move(shinny=0.5)
+    table = tb.TabulatedBRDF.from_model(Lambert((0.1, 0.5, 0.2)), EMBEDDING.grid_, "mine")
+    edit.layers[-1].effect = tb.Assign(table)
+    assert edit.material("body").name == "red-rubber"
+    assert edit.reached("body") is None
+    edit.save(tmp_path / "hidden.tbr")
+    again = EditSession.load(tmp_path / "hidden.tbr")
+    assert again.history == edit.history
+    again.layers[-1].visible = True
+    same(again.brdf("body").values, table.values)
+
+
+def test_an_effect_means_what_the_palette_says():
+    """The same effect in two sessions: a name is looked up in the library at hand."""
+    picked = [3, 11, LIBRARY.index("chrome")]
+    other = tb.Library(
+        EMBEDDING,
+        ["chrome", "white-plastic", "concrete"],
+        LIBRARY.coordinates[picked],
+        ["a", "b", "c"],
+    )
+    effect = Assign("chrome")
+    palettes = (PALETTE, Palette(other, PALETTE.traits), PALETTE)
+    found = [effect.apply(PLAIN, 1.0, palette).material.z for palette in palettes]
+    same(found[0], found[2])
+    same(found[1], EMBEDDING.clip(LIBRARY.coordinates[3]))
+
+
 def test_a_layer_that_is_gone_says_so(edit):
     edit.move("body", shiny=0.5)
     top = edit.layers[-1]

@@ -304,15 +304,13 @@ class Document:
         self._states, self._folded = states, design
 
     def _apply(self, layer: Layer, part: str, material: Material) -> Applied:
-        if not layer.visible:
-            return Applied(material)
         key = id(layer.effect), layer.weight(part), material
         if key in self._outcomes:
             self._outcomes.move_to_end(key)
-            return self._outcomes[key][1]
-        found = layer.effect.apply(material, layer.weight(part), self._palette)
-        self._remember(layer, part, material, found)
-        return found
+        else:  # hidden layers as well: what is wrong with their effects is told now
+            found = layer.effect.apply(material, layer.weight(part), self._palette)
+            self._remember(layer, part, material, found)
+        return self._outcomes[key][1] if layer.visible else Applied(material)
 
     def _remember(self, layer: Layer, part: str, material: Material, found: Applied) -> None:
         # the effect stands beside its outcome: while it lives, no other has its id

@@ -121,13 +121,24 @@ class Effect:
             said.pop()
         return ", ".join(repr(getattr(self, f.name)) for f in said)
 
-    def state(self) -> dict[str, Any]:
-        """Return the fields that a design file stores, by name."""
+    def state(self, palette: Palette) -> dict[str, Any]:
+        """Return the fields that a design file stores, by name.
+
+        Parameters
+        ----------
+        palette : Palette, of the design
+        """
         return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], palette: Palette) -> Self:
-        """Make an effect from its `state`."""
+        """Make an effect from its `state`.
+
+        Parameters
+        ----------
+        state : mapping of field to value
+        palette : Palette, of the design
+        """
         return cls(**state)
 
 
@@ -234,8 +245,8 @@ class Assign(Effect):
     Parameters
     ----------
     material : a library name, a `TabulatedBRDF`, a model or measured BRDF, or coordinates (k,)
-    known : Material or None
-        What `material` came to with the palette at hand; None finds it when it is needed.
+    known : (Library, Material) or None
+        What `material` means with a library, if that is known already.
 
     Raises
     ------
@@ -250,7 +261,7 @@ class Assign(Effect):
 
     anywhere: ClassVar[bool] = False
     material: Any
-    known: Material | None = field(default=None, compare=False)
+    known: tuple[Library, Material] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         given = self.material
@@ -272,12 +283,17 @@ class Assign(Effect):
         return Applied(new if weight >= 1.0 else blended(material, new, weight))
 
     def resolved(self, palette: Palette) -> Material:
-        """Return the material to assign; a table is encoded once."""
+        """Return the material to assign; a table is encoded once.
+
+        Parameters
+        ----------
+        palette : Palette
+        """
         known = self.known
-        if known is None:
-            known = self._found(palette)
+        if known is None or known[0] is not palette.library:
+            known = palette.library, self._found(palette)
             object.__setattr__(self, "known", known)
-        return known
+        return known[1]
 
     def _found(self, palette: Palette) -> Material:
         if isinstance(self.material, str):
@@ -309,10 +325,10 @@ class Assign(Effect):
             return _MODEL_NAMES.sub(r"tb.models.\g<0>", repr(given))
         return f"tables[{named(given)!r}]"
 
-    def state(self) -> dict[str, Any]:
-        """Return what was given, where a file can hold it, and the material that it came to."""
+    def state(self, palette: Palette) -> dict[str, Any]:
+        """Return what was given, if a file can hold it, and the material that it means."""
         given = self.material if self.table is None else None
-        return {"material": given, "known": self.known}
+        return {"material": given, "known": self.resolved(palette)}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], palette: Palette) -> Self:
@@ -327,7 +343,7 @@ class Assign(Effect):
             given = TabulatedBRDF(
                 grid, known.table.reshape(*grid.shape, 3), known.mirror, known.name
             )
-        return cls(given, known)
+        return cls(given, (palette.library, known))
 
 
 MODELS = {

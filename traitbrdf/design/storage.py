@@ -80,7 +80,7 @@ def write_design(
     else:
         raise TypeError(f"save: expected a sphere or a mesh, got {scene.shape!r}")
     design, palette = document.design, document.palette
-    pool = _Pool()
+    pool = _Pool(palette)
     header = {
         "format": _FORMAT,
         "embedding": palette.embedding.fingerprint(),
@@ -118,7 +118,8 @@ _LAYER = [f for f in dataclasses.fields(Layer) if f.name != "key"]
 class _Pool:
     """Materials of a file, each of which stands there once."""
 
-    def __init__(self) -> None:
+    def __init__(self, palette: Palette) -> None:
+        self._palette = palette
         self.entries: list[dict[str, Any]] = []
         self._places: dict[Material, int] = {}
         self._points: list[NDArray[np.float64]] = []
@@ -150,7 +151,7 @@ class _Pool:
         kind = type(value).__name__
         if _VALUES.get(kind) is type(value):
             if kind in KINDS:
-                state = value.state()
+                state = value.state(self._palette)
             elif dataclasses.is_dataclass(value):
                 state = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             else:
