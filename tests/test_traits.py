@@ -190,8 +190,8 @@ def test_a_drag_is_smooth_between_the_steps_of_a_move(z, name, hold, up):
     moves = [SPACE.reach(z, {name: a}, hold) for a in amounts]
     way = np.array([m.z for m in moves])
     shown = np.array([SPACE.colours(point) for point in way])
-    # a step of 0.05 may show 20; the worst step of a seventh of it shows at most 2.7 in all but 9 of
-    # 496 random drags, and 4.3 in the worst, where the gamut ends
+    # a step of 0.05 may show 20; the worst step of a seventh of it shows at most 2.7 in all but 9
+    # of 496 random drags, and 4.3 in the worst, where the gamut ends
     assert np.linalg.norm(np.diff(shown, axis=0), axis=-1).max() < 6.0
     for amount, m in zip(amounts, moves, strict=True):
         if m.complete:
