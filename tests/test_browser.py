@@ -242,7 +242,7 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         for force in (0.2, 0.9):
             driver.pen(line, force)
             driver.edits(3)
-            amounts.append(session.edit.last.said.call().split("amount=")[1].split(",")[0])
+            amounts.append(session.edit.history[-1].split("amount=")[1].split(",")[0])
             driver.press("Control+z")
             driver.edits(2)
         assert 0.0 < 3.0 * float(amounts[0]) < float(amounts[1])
