@@ -175,6 +175,12 @@ def test_info(tmp_path: Path, shared_data: Path, capsys: pytest.CaptureFixture[s
              "first image after a change of view"],
             marks=pytest.mark.slow,
         ),
+        pytest.param(
+            "live",
+            ["live after a change of light, 1000 nodes",
+             "edit to frame after a change of view, 4000 nodes"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )  # fmt: skip
 def test_bench_writes_records(

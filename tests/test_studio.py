@@ -639,7 +639,8 @@ def test_a_served_session(server):
         with pytest.raises(ConnectionClosed) as closed:
             socket.send(bytes(LARGEST + 100))
             socket.recv()
-        assert closed.value.rcvd.code == 1009  # too big
+        told = closed.value.rcvd  # None where the line was cut while the message was on its way
+        assert told is None or told.code == 1009  # too big
     with reach(server) as socket:  # and the next tab is served
         socket.send(pack({"kind": "hello", "view": "b", "seq": 1}, []))
         assert unpack(socket.recv())[0]["kind"] == "frame"

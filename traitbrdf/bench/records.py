@@ -75,8 +75,8 @@ class Record:
 
 
 NAMES = (
-    "transport", "families", "shadows", "table", "embedding", "edit", "prepare", "peers", "traits",
-    "promises", "trade",
+    "transport", "families", "shadows", "table", "embedding", "edit", "prepare", "live", "peers",
+    "traits", "promises", "trade",
 )  # fmt: skip
 """Names of the benches; `traitbrdf.bench.run` maps them to functions."""
 

@@ -108,6 +108,20 @@ def fixed_key(whole: str | None, fixed: Mapping[int, Float32]) -> str | None:
     return _hash(whole, *(x for pair in fixed.items() for x in pair))
 
 
+def universal_key(library: Library, seed: int) -> str:
+    """Return a name of the universal basis of a library.
+
+    Parameters
+    ----------
+    library : Library
+    seed : int
+    """
+    return _hash(
+        "universal", _CACHE_FORMAT, _code(), library.embedding.fingerprint(), library.coordinates,
+        seed,
+    )  # fmt: skip
+
+
 _FRAGMENTS = ("pixels", "pixel_part", "weights", "bordering", "offsets")
 _SAMPLES = ("normals", "views", "positions", "starts")
 

@@ -15,6 +15,7 @@ from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.preparation import Preparation, Prepared
 from traitbrdf.space.material import Material
 from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.nodes import NodeTransport
 from traitbrdf.transport.transport import PartFrame, Transport
 
 Float32 = NDArray[np.float32]
@@ -45,7 +46,10 @@ class Shown:
 
 
 class Drafted(NamedTuple):
-    """A draft: its image (h, w, 3) and measured error, and what it shows."""
+    """A draft: its image (h, w, 3) and measured error, and what it shows.
+
+    Its size is in pixels, or minus a number of nodes.
+    """
 
     size: int
     materials: tuple[Material, ...]
@@ -70,6 +74,8 @@ class View:
     exact_frames: int = 0
     draft: tuple[int, Draft] | None = None
     drafted: Drafted | None = None
+    nodes: NodeTransport | None = None
+    decoded: dict[Material, Float32] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
 
     def keep(self, index: int, material: Material, shown: Shown) -> None:

@@ -17,19 +17,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.design.effects import Palette
 from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.budget import QUALITIES, TRUSTED, Promise, keep
-from traitbrdf.session.cache import Cache, cache_key, fixed_key
+from traitbrdf.session.cache import Cache, cache_key, fixed_key, universal_key
 from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.library import Library
 from traitbrdf.space.material import Material
-from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.basis import Training, training_tables
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import light_tree
 from traitbrdf.transport.transport import Transport
+from traitbrdf.transport.universal import UniversalBasis
 from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
@@ -43,6 +44,9 @@ the frame's error hardly changes, and an exact frame would take a thousand times
 
 TRAINED_MEMBERS = 400
 """Members of the library that a basis is fitted to; more members span little more."""
+
+NODES = (1000, 4000)
+"""Numbers of nodes, one after the other, that show edits until a view is prepared."""
 
 DRAFT_SIZE = 128
 """Pixels along the longer side of a draft."""
@@ -319,11 +323,11 @@ def timed(call: Callable[[], object], device: torch.device) -> float:
 def prepare_view(
     scene: Scene,
     settings: Settings,
-    library: Library,
-    traits: TraitSpace,
+    palette: Palette,
     cache: Cache | None,
     fixed: Mapping[int, Material],
     known: Transport | None,
+    begin: Callable[[Progress], None],
     report: Progress,
 ) -> Prepared:
     """Prepare a scene for edits.
@@ -333,19 +337,22 @@ def prepare_view(
     scene : Scene
     settings : Settings
         A promise of error or speed decides how many basis images are used.
-    library, traits : Library, TraitSpace
+    palette : Palette
         What the scene is edited with.
     cache : Cache or None
     fixed : mapping of part index to Material
         Parts that are not edited, and their materials.
     known : Transport or None
         An earlier preparation of the scene with fewer parts free; it is extended.
+    begin : callable
+        Is called, to show something meanwhile, if the scene is not in the cache.
     report : callable
         Is told of each stage and fraction.
     """
     report("compiling", 0.0)
+    library, traits = palette.library, palette.traits
     traits.reach(library.coordinates[0], {traits.names[0]: 0.1})  # else the first stroke waits
-    prepared = _transport(scene, settings, library, cache, fixed, known, report)
+    prepared = _transport(scene, settings, library, cache, fixed, known, begin, report)
     if settings.quality == "reference" or (settings.error is None and settings.fps is None):
         return prepared
     report("measuring", 1.0)
@@ -406,6 +413,7 @@ def _transport(
     cache: Cache | None,
     fixed: Mapping[int, Material],
     known: Transport | None,
+    begin: Callable[[Progress], None],
     report: Progress,
 ) -> Prepared:
     """Compute the transport with all basis images of a quality, or read it from the cache."""
@@ -429,6 +437,7 @@ def _transport(
             else:
                 report("reading", 1.0)
                 return Prepared(transport, True, some, transport)
+    begin(report)
     report("tables", 0.0)
     training = training_of(library, seed)
     report("tables", 0.0)
@@ -455,3 +464,27 @@ def training_of(library: Library, seed: int) -> Training:
         library.embedding.decode_values(library.coordinates[i]) for i in trained_members(library)
     ]
     return training_tables(np.concatenate(channels, axis=1), library.embedding.grid_, seed)
+
+
+def universal_basis(library: Library, seed: int, cache: Cache, report: Progress) -> UniversalBasis:
+    """Return the universal basis of a library: from the cache, or fitted and put there.
+
+    Parameters
+    ----------
+    library : Library
+    seed : int
+    cache : Cache
+    report : callable
+        Is told of each stage and fraction.
+    """
+    key, grid = universal_key(library, seed), library.embedding.grid_
+    arrays = cache.read(key) or {}
+    try:
+        return UniversalBasis(grid, arrays["tables"], arrays["projection"], arrays["typical"])
+    except KeyError:  # missing, or written by something else
+        report("universal basis", 0.0)
+        training = training_of(library, seed)
+        basis = UniversalBasis.fit(grid, training, seed=seed, progress=report)
+        names = ("tables", "projection", "typical")
+        cache.write_behind(key, {name: getattr(basis, name) for name in names})
+        return basis

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.design.effects import Palette
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap, Light
@@ -33,11 +34,13 @@ from traitbrdf.session.cache import Cache
 from traitbrdf.session.frames import Drafted, View, enlarged, measured
 from traitbrdf.session.preparation import (
     DRAFT_SIZE,
+    NODES,
     TURNS,
     LightTrees,
     Preparation,
     Prepared,
     prepare_view,
+    universal_basis,
 )
 from traitbrdf.session.rendering import Renderer
 from traitbrdf.session.settings import Settings
@@ -47,6 +50,7 @@ from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.angles import AnglesSeen, angles_seen
 from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.nodes import NodeTransport
 from traitbrdf.transport.transport import Transport
 from traitbrdf.transport.visibility import Progress
 
@@ -288,7 +292,7 @@ class Viewer:
                     return transport
                 fresh = job is None
                 if job is None:
-                    job = view.job = self._new_job(view)
+                    job = view.job = self._new_job(view, shown=not wait)
                 elif job.error is not None:
                     view.job = None
             if fresh and not wait:
@@ -308,7 +312,7 @@ class Viewer:
             if job.stopped and self._view is view and self._serving(view) is None:
                 raise CancelledError("the preparation was cancelled")
 
-    def _new_job(self, view: View) -> Preparation:
+    def _new_job(self, view: View, shown: bool) -> Preparation:
         # neither function holds the session, so that an unused one can be collected
         lock = self._lock
 
@@ -316,7 +320,7 @@ class Viewer:
             with lock:
                 known = view.prepared
                 if known is None or len(known.fixed) > len(prepared.fixed):
-                    view.prepared, view.canvas = prepared, None
+                    view.prepared, view.canvas, view.nodes = prepared, None, None
                     view.times["prepare"] = job.seconds
                 if view.job is job:
                     view.job = None
@@ -325,8 +329,32 @@ class Viewer:
         if scene.ground and scene.parts[-1] not in self._edited and view.prepared is None:
             fixed[len(scene.parts) - 1] = self.materials[scene.parts[-1]]
         known = None if view.prepared is None else view.prepared.whole
+        palette, settings = Palette(self.library, self.traits), self.settings
+        library, cache, trees = self.library, self._cache, self._trees
+        present = [self.materials[part] for part in scene.parts]
+
+        def begin(report: Progress) -> None:
+            """Prepare images at nodes, which show edits until the whole is prepared."""
+            # who waits for the frame does not look at drafts
+            if cache is None or known is not None or not shown:
+                return
+            basis = universal_basis(library, settings.seed, cache, report)
+            decoded = {m: m.values(library.embedding) for m in present}
+            tables = [decoded[m] for m in present]
+            nodes: NodeTransport | None = None
+            for count in NODES:
+                if nodes is None:
+                    nodes = NodeTransport(
+                        scene, basis, tables, count, tree=trees.of(scene.environment),
+                        seed=settings.seed, progress=report,
+                    )  # fmt: skip
+                else:
+                    nodes = nodes.refined(count, tables, report)
+                with lock:
+                    view.nodes = nodes
+
         work = functools.partial(
-            prepare_view, scene, self.settings, self.library, self.traits, self._cache, fixed, known
+            prepare_view, scene, settings, palette, cache, fixed, known, begin
         )  # fmt: skip
         return Preparation(work, publish, self.progress, weakref.ref(self))
 
@@ -339,36 +367,58 @@ class Viewer:
                 job.stop()
 
     def draft(self, size: int | None = None) -> tuple[Float32, float]:
-        """Render a first image at once, without any preparation.
+        """Render a first image at once, before the view is prepared.
 
-        It is rendered at a small size and enlarged. The first draft of a view takes longer than
-        later ones.
+        It is rendered at a small size and enlarged; the first one of a view takes longer than
+        later ones. As soon as a running preparation has images at some nodes, drafts have the
+        size of the scene and take milliseconds.
 
         Parameters
         ----------
         size : int
-            Pixels along the longer side at which it is rendered; None is 128.
+            Pixels along the longer side at which it is rendered; None is the best at hand, or 128.
 
         Returns
         -------
         image : (H, W, 3) float32 linear radiance, backdrop included
         error : float
-            Mean relative L1 over the small image's covered pixels, measured at some of them.
+            Mean relative L1 over the covered pixels, measured at some of them.
+
+        Raises
+        ------
+        ValueError
+            If `size` is no positive integer.
         """
-        size = DRAFT_SIZE if size is None else size
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        wanted = DRAFT_SIZE if size is None else size
+        if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
             raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
         while True:
             with self._lock:
                 view = self._view
                 scene = view.scene
                 materials = tuple(self.materials[part] for part in scene.parts)
-            known = view.drafted
-            if known is None or known.size != size or known.materials != materials:
-                with TURNS.urgent():
-                    known = view.drafted = self._draft(view, materials, size)
+                nodes = view.nodes if size is None else None
+            known, kind = view.drafted, wanted if nodes is None else -len(nodes.nodes)
+            if known is None or known.size != kind or known.materials != materials:
+                if nodes is None:
+                    with TURNS.urgent():
+                        known = self._draft(view, materials, wanted)
+                else:
+                    known = self._at_nodes(view, nodes, materials)
+                view.drafted = known
             if view is self._view:  # else it is a picture of what was looked at before
                 return enlarged(known.image, scene.height, scene.width), known.error
+
+    def _at_nodes(
+        self, view: View, nodes: NodeTransport, materials: tuple[Material, ...]
+    ) -> Drafted:
+        start = time.perf_counter()
+        known = view.decoded
+        tables = {m: known[m] if m in known else m.values(self.embedding) for m in materials}
+        view.decoded = tables
+        frame = nodes.frame([tables[m] for m in materials], [m.mirror for m in materials])
+        view.times["draft"] = time.perf_counter() - start
+        return Drafted(-len(nodes.nodes), materials, *frame)
 
     def _draft(self, view: View, materials: tuple[Material, ...], size: int) -> Drafted:
         start = time.perf_counter()

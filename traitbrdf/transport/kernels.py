@@ -839,3 +839,59 @@ def shade_rows(
                 found = _collect(row, found, sample, leaves, count, tables, stencil)
         if found > 0:
             _release(out[current], row, found, tables)
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+def kriging_weights(out: Any, points: Any, at: Any, near: Any) -> None:
+    """Solve for the weights of ordinary kriging with the variogram d^1.5.
+
+    The weights minimise the expected squared error of a sum over neighbours, under the condition
+    that they add up to 1 (Cressie, "Statistics for Spatial Data", 1993, section 3.2).
+
+    Parameters
+    ----------
+    out : (q, k) float32
+        The weights, written.
+    points : (n, d) float32
+        Known places.
+    at : (q, d) float32
+        Places to interpolate at.
+    near : (q, k) int64
+        Neighbours of each among `points`, all different.
+    """
+    count, k = near.shape
+    for i in numba.prange(count):
+        system = np.zeros((k + 1, k + 2))
+        for a in range(k):
+            for b in range(a):
+                square = 0.0
+                for d in range(points.shape[1]):
+                    square += (points[near[i, a], d] - points[near[i, b], d]) ** 2
+                system[a, b] = system[b, a] = square**0.75
+            square = 0.0
+            for d in range(points.shape[1]):
+                square += (points[near[i, a], d] - at[i, d]) ** 2
+            system[a, a] = -1e-9
+            system[a, k] = system[k, a] = 1.0
+            system[a, k + 1] = square**0.75
+        system[k, k + 1] = 1.0
+        for a in range(k + 1):  # Gaussian elimination with row pivots
+            pivot = a
+            for b in range(a + 1, k + 1):
+                if abs(system[b, a]) > abs(system[pivot, a]):
+                    pivot = b
+            if pivot != a:
+                for c in range(a, k + 2):
+                    system[a, c], system[pivot, c] = system[pivot, c], system[a, c]
+            for b in range(a + 1, k + 1):
+                factor = system[b, a] / system[a, a]
+                if factor != 0.0:
+                    for c in range(a, k + 2):
+                        system[b, c] -= factor * system[a, c]
+        for a in range(k, -1, -1):
+            rest = system[a, k + 1]
+            for c in range(a + 1, k + 1):
+                rest -= system[a, c] * system[c, k + 1]
+            system[a, k + 1] = rest / system[a, a]
+        for a in range(k):
+            out[i, a] = system[a, k + 1]
