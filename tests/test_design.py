@@ -575,6 +575,38 @@ def test_the_history_replays_to_the_identical_frame(edit, fresh):
     same(again.render(), edit.render())
 
 
+def test_moves_that_are_forbidden_by_now_replay(edit, fresh, tmp_path):
+    """Refused when asked for, but not where a layer became one later."""
+    forbidden = tb.Move(glossy=0.5, specular=-0.5, hold=("strength", "sharpness", "shiny"))
+    moved = next(
+        name
+        for name in LIBRARY.names
+        if PALETTE.traits.reach(
+            LIBRARY.coordinates[LIBRARY.index(name)], dict(forbidden.amounts), forbidden.hold
+        ).stopped.startswith("held")
+    )
+    edit.assign(["body", "lid"], moved)
+    with pytest.raises(ValueError, match="cannot move"):
+        edit.move("body", dict(forbidden.amounts), hold=forbidden.hold)
+    edit.move("body", bright=0.1)
+    edit.layers[-1].effect = forbidden
+    edit.paint(on(edit.scene, "lid", 0.1, "bright"))
+    edit.layers[-1].effect = tb.Move(glossy=0.5, hold=("shiny", "matte"))
+    edit.apply("lid", forbidden)
+    edit.apply("lid", forbidden)
+    edit.layers[-1].visible = False
+    edit.apply({"lid": 0.5}, forbidden)
+    edit.layers[-1].opacity = 0.5
+    again = replay(edit, fresh())
+    assert again.history == edit.history
+    edit.save(tmp_path / "design.tbr")
+    loaded = EditSession.load(tmp_path / "design.tbr")
+    third = replay(loaded, fresh())
+    for part in edit.scene.parts:
+        for other in (again, loaded, third):
+            same(other.material(part).z, edit.material(part).z)
+
+
 @pytest.mark.parametrize("name", [*SYNONYMS, *ODD])
 def test_history_names_every_trait(edit, fresh, odd_traits, name):
     session = fresh(traits=odd_traits)

@@ -9,7 +9,7 @@ computed from there on.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -126,13 +126,16 @@ class Design:
             named.append((table, name if counts[name] == 1 else f"{name} ({counts[name]})"))
         return named
 
-    def history(self, framing: Framing) -> list[str]:
+    def history(self, framing: Framing, idle: Container[int] = ()) -> list[str]:
         """Return the Python statements that make the design on a fresh session, in order.
 
         Parameters
         ----------
         framing : Framing
             Strokes that were painted under another one are told as the parts that they touched.
+        idle : keys of layers
+            Those whose effect can do nothing at present. They are told by calls that do not
+            refuse such an effect.
         """
         names = self._named()
 
@@ -140,7 +143,9 @@ class Design:
             return next((name for other, name in names if other is table), table_name(table))
 
         said = [one.under(framing) for one in self.recorded]
-        return [*said, *(call for layer in self.layers for call in layer.calls(framing, named))]
+        for layer in self.layers:
+            said += layer.calls(framing, named, layer.key in idle)
+        return said
 
 
 class Folded(NamedTuple):
@@ -163,7 +168,7 @@ class Document:
     ----------
     design : Design
     palette : Palette, that effects are applied with
-    known : for each layer, the material of each part that it touches, if that is known
+    known : for each layer, what came of it on each part that it touches, if that is known
         A file keeps what its layers came to, so that it opens as it was saved.
 
     Attributes
@@ -175,7 +180,7 @@ class Document:
         self,
         design: Design,
         palette: Palette,
-        known: Iterable[Mapping[str, Material]] = (),
+        known: Iterable[Mapping[str, Applied]] = (),
     ) -> None:
         self._palette = palette
         self._outcomes: OrderedDict[Any, tuple[Effect, Applied]] = OrderedDict()
@@ -183,10 +188,10 @@ class Document:
         self._folded = replace(design, layers=())
         self._past: list[Design] = []
         self._future: list[Design] = []
-        for layer, materials in zip(design.layers, known, strict=False):
-            for part, material in materials.items():
-                self._remember(layer, part, self.materials[part], Applied(material))
-            applied = {part: Applied(material) for part, material in materials.items()}
+        for layer, applied in zip(design.layers, known, strict=False):
+            for part, one in applied.items():
+                self._remember(layer, part, self.materials[part], one)
+            materials = {part: one.material for part, one in applied.items()}
             self._states.append(Folded({**self.materials, **materials}, applied))
             self._folded = self._folded.with_layer(layer)
         self._fold(design)
@@ -207,12 +212,9 @@ class Document:
         return self._states[-1].applied
 
     @property
-    def outcomes(self) -> list[Mapping[str, Material]]:
-        """For each layer, the materials of the parts that it touches, as `known` has them."""
-        return [
-            {part: one.material for part, one in state.applied.items()}
-            for state in self._states[1:]
-        ]
+    def outcomes(self) -> list[Mapping[str, Applied]]:
+        """For each layer, what came of it on the parts that it touches, as `known` has it."""
+        return [state.applied for state in self._states[1:]]
 
     @property
     def palette(self) -> Palette:
@@ -237,13 +239,36 @@ class Document:
             self._palette, self._states, self._folded, self._outcomes = old
             raise
 
-    def add(self, layer: Layer) -> None:
-        """Put a layer on top; ValueError where its effect cannot do anything at all."""
+    def add(self, layer: Layer, check: bool = False) -> None:
+        """Put a layer on top.
+
+        Parameters
+        ----------
+        layer : Layer
+        check : bool
+            Whether to raise ValueError where its effect cannot do anything at all.
+        """
         new = self.design.with_layer(layer)
-        for part, _ in layer.mask.weights:
+        for part, _ in layer.mask.weights if check else ():
             below = self.materials[part]
             layer.effect.check(below, self._apply(layer, part, below), self._palette)
         self.change(new)
+
+    def history(self, framing: Framing) -> list[str]:
+        """Return the Python statements that make the design on a fresh session, in order.
+
+        Parameters
+        ----------
+        framing : Framing
+            Strokes that were painted under another one are told as the parts that they touched.
+        """
+        idle = {
+            layer.key
+            for layer, applied in zip(self.design.layers, self.outcomes, strict=True)
+            # one that is hidden or faint could be refused when it is added, before that is set
+            if layer.strength < 1.0 or any(one.refused for one in applied.values())
+        }
+        return self.design.history(framing, idle)
 
     def change(self, design: Design) -> None:
         """Replace the design, undoably; on errors of its effects nothing is changed."""

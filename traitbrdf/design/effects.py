@@ -52,10 +52,18 @@ class Palette:
 
 
 class Applied(NamedTuple):
-    """What an effect made of a material, and how far a move of traits came (else None)."""
+    """What an effect made of a material.
+
+    Attributes
+    ----------
+    material : Material
+    moved : how far a move of traits came; None for other effects, and if it is not known
+    refused : whether the effect could do nothing, so that `Effect.check` raises
+    """
 
     material: Material
     moved: Moved | None = None
+    refused: bool = False
 
 
 def table_name(brdf: Reflectance) -> str:
@@ -198,13 +206,14 @@ class Move(Effect):
     def apply(self, material: Material, weight: float, palette: Palette) -> Applied:
         """Follow the flow of the traits for a share `weight` of the amounts; see `Effect.apply`."""
         found = palette.traits.reach(material.z, self._scaled(weight), self.hold, self.photoreal)
-        if np.array_equal(found.z, material.z):
-            return Applied(material, found)
+        refused = found.stopped.startswith("held")
+        if refused or np.array_equal(found.z, material.z):
+            return Applied(material, found, refused)
         return Applied(replace(material, z=found.z, table=None), found)
 
     def check(self, material: Material, applied: Applied, palette: Palette) -> None:
         """Raise ValueError where held traits forbid the move."""
-        if applied.moved is not None and applied.moved.stopped.startswith("held"):
+        if applied.refused and applied.moved is not None:
             palette.traits.moved(material.z, applied.moved.asked, self.hold, self.photoreal)
 
     def _scaled(self, weight: float) -> dict[str, float]:

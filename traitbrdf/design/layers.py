@@ -52,9 +52,12 @@ class Layer:
 
     def weight(self, part: str) -> float:
         """Return how much of the effect a part gets: 0 where the layer does not count."""
-        if not self.visible:
-            return 0.0
-        return self.opacity * dict(self.mask.weights).get(part, 0.0)
+        return self.strength * dict(self.mask.weights).get(part, 0.0)
+
+    @property
+    def strength(self) -> float:
+        """Its opacity; 0 if it is hidden."""
+        return self.opacity if self.visible else 0.0
 
     @property
     def anywhere(self) -> set[str]:
@@ -63,7 +66,7 @@ class Layer:
             return set()
         return {part for part, _ in self.mask.weights}
 
-    def calls(self, framing: Framing, named: Named = table_name) -> list[str]:
+    def calls(self, framing: Framing, named: Named = table_name, idle: bool = False) -> list[str]:
         """Return the Python statements that add the layer to an `EditSession`.
 
         Parameters
@@ -71,6 +74,8 @@ class Layer:
         framing : Framing
             A stroke that was painted under another one is told as the parts that it touched.
         named : as for `Effect.call`
+        idle : bool
+            Whether the effect does nothing at present, so that a call could refuse it.
         """
         settings = [
             f"edit.layers[-1].{name} = {value!r}"
@@ -81,14 +86,17 @@ class Layer:
             )
             if value != usual
         ]
-        return [self._added(framing, named), *settings]
+        return [self._added(framing, named, idle), *settings]
 
-    def _added(self, framing: Framing, named: Named) -> str:
+    def _added(self, framing: Framing, named: Named, idle: bool) -> str:
         mask, effect = self.mask, self.effect
         if not isinstance(mask, Painted) or mask.framing != framing:
+            if idle:
+                return f"edit.apply({mask.source()}, {effect.source(named)})"
             return effect.call(mask.source(), named)
         said = [repr([*mask.stroke.points])]
-        if isinstance(effect, Move) and len(effect.amounts) == 1 and effect.photoreal:
+        plain = isinstance(effect, Move) and len(effect.amounts) == 1 and effect.photoreal
+        if isinstance(effect, Move) and plain and not idle:
             ((trait, amount),) = effect.amounts
             said += [f"trait={trait!r}", f"amount={amount!r}"]
             hold = "" if effect.hold is None else f", hold={effect.hold!r}"

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.design.document import Design, Document, Recorded
-from traitbrdf.design.effects import KINDS, MODELS, Palette
+from traitbrdf.design.effects import KINDS, MODELS, Applied, Palette
 from traitbrdf.design.layers import Layer
 from traitbrdf.design.masks import Framing, Painted, Parts
 from traitbrdf.design.strokes import Stroke
@@ -97,7 +97,8 @@ def write_design(
         "layers": [
             {
                 **{f.name: pool.plain(getattr(layer, f.name)) for f in _LAYER},
-                "after": {part: pool.place(material) for part, material in after.items()},
+                "after": {part: pool.place(one.material) for part, one in after.items()},
+                "refused": [part for part, one in after.items() if one.refused],
             }
             for layer, after in zip(design.layers, document.outcomes, strict=True)
         ],
@@ -304,7 +305,8 @@ class Stored:
                     f"layers: expected outcomes of {layer.mask.weights}, got {[*after]}"
                 )
             layers.append(layer)
-            known.append(after)
+            refused = set(entry["refused"])
+            known.append({part: Applied(one, None, part in refused) for part, one in after.items()})
         recorded = tuple(
             Recorded(str(call), str(anywhere), value(framing))
             for call, anywhere, framing in header["recorded"]

@@ -230,7 +230,8 @@ class EditSession(Viewer):
         If the whole amount cannot be reached, the material moves as far as it can; `reached`
         returns how far that is, and why.
         """
-        self.apply(part, Move(amounts, hold=hold, photoreal=photoreal, **more))
+        move = Move(amounts, hold=hold, photoreal=photoreal, **more)
+        self._add(Layer(move, Parts.of(part)), check=True)
 
     def apply(self, part: Target, effect: Effect) -> None:
         """Put a layer of any effect on parts: ``edit.apply("handle", tb.Move(shiny=0.6))``.
@@ -244,6 +245,11 @@ class EditSession(Viewer):
         ------
         ValueError, TypeError
             On an unknown part, or as the effect does. Nothing is changed then.
+
+        Notes
+        -----
+        A move that held traits forbid becomes a layer that does nothing, until the layers below it
+        change; `move` refuses it.
         """
         self._add(Layer(effect, Parts.of(part)))
 
@@ -278,13 +284,13 @@ class EditSession(Viewer):
         if (effect is None) == (stroke.trait is None):
             given = "neither" if effect is None else "both"
             raise ValueError(f"stroke: expected one with a trait, or an effect; got {given}")
-        amount = 1.0
+        amount, own = 1.0, effect is None
         if effect is None and stroke.trait is not None:
             self.traits.index(stroke.trait)
             effect, amount = Move({stroke.trait: stroke.amount}, hold=stroke.hold), stroke.amount
         with self._lock:
             mask = self._mask(stroke, only)
-            self._add(Layer(effect, mask))  # type: ignore[arg-type]
+            self._add(Layer(effect, mask), check=own)  # type: ignore[arg-type]
         return {part: float(amount * weight) for part, weight in mask.weights}
 
     def _mask(self, stroke: Stroke, only: str | Iterable[str] | None) -> Painted:
@@ -310,11 +316,11 @@ class EditSession(Viewer):
         bare = Stroke(stroke.points, radius=stroke.radius)
         return Painted(weights, bare, Framing.of(scene), only)
 
-    def _add(self, layer: Layer) -> None:
+    def _add(self, layer: Layer, check: bool = False) -> None:
         with self._lock:
             for part, _ in layer.mask.weights:
                 self.part(part)
-            self._document.add(layer)
+            self._document.add(layer, check)
             self._edited |= layer.anywhere
 
     def _change(self, change: Callable[[Design], Design]) -> None:
@@ -406,7 +412,7 @@ class EditSession(Viewer):
         of another camera or size are told as the parts that they touched.
         """
         with self._lock:
-            return self.design.history(Framing.of(self.scene))
+            return self._document.history(Framing.of(self.scene))
 
     def before(self) -> Float32:
         """Return the frame (H, W, 3) as it would be without any layer; nothing is changed."""
