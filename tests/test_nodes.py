@@ -295,6 +295,19 @@ def test_a_look_leaves_no_frame_of_the_old_view(held):
     assert not np.array_equal(held.draft(32)[0], old)
 
 
+def test_a_cancelled_preparation_leaves_its_nodes(held):
+    nodes, first = held.view.nodes, held.progress
+    held.cancel()
+    first.opened.set()
+    held.progress = second = Hold("tables")
+    try:
+        held.prepare(wait=False)
+        assert second.reached.wait(60.0)
+        assert held.view.nodes is nodes
+    finally:
+        second.opened.set()
+
+
 def test_the_prepared_frame_follows_without_a_jump(held):
     drafted, said = held.draft()
     held.progress.opened.set()

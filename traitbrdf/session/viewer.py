@@ -341,8 +341,10 @@ class Viewer:
             basis = universal_basis(library, settings.seed, cache, report)
             decoded = {m: m.values(library.embedding) for m in present}
             tables = [decoded[m] for m in present]
-            nodes: NodeTransport | None = None
+            nodes = view.nodes
             for count in NODES:
+                if nodes is not None and nodes.count >= count:
+                    continue  # of a preparation of this view that was cancelled
                 if nodes is None:
                     nodes = NodeTransport(
                         scene, basis, tables, count, tree=trees.of(scene.environment),

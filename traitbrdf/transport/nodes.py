@@ -100,6 +100,8 @@ class NodeTransport:
 
     Attributes
     ----------
+    count : int
+        Number of nodes that was asked for; there are fewer in a small scene.
     nodes : (n,) int64
         Fragments at which images are computed.
     """
@@ -117,7 +119,7 @@ class NodeTransport:
     ) -> None:
         report = progress or (lambda stage, fraction: None)
         report("nodes", 0.0)
-        self.scene, self.basis = scene, basis
+        self.scene, self.basis, self.count = scene, basis, count
         self._operator = Operator(scene, basis.grid, resolution, tree)
         self._rng = np.random.default_rng(seed)
         self._places = _places(scene)
@@ -155,6 +157,7 @@ class NodeTransport:
         """
         report = progress or (lambda stage, fraction: None)
         other = copy.copy(self)
+        other.count = count
         other._groups = [self._more(group, count, tables, report) for group in self._groups]
         other._join(report)
         return other
