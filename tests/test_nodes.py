@@ -218,11 +218,16 @@ def test_extremes(universal, size, settings, count):
     assert len(found.refined(10 * count, tables).frame(tables).image)
 
 
-def test_fewer_nodes_than_neighbours(universal):
-    seen = scene(24)
+def test_each_part_has_nodes_however_small_it_is(universal):
+    seen = scene(12)
     tables = [TABLES[1]] * len(seen.parts)
-    found = NodeTransport(seen, universal, tables, NEIGHBOURS // 2)
-    assert 1 <= len(found.nodes) <= NEIGHBOURS
+    found = NodeTransport(seen, universal, tables, 1)
+    sizes = [len(part.at) for part in found.parts]
+    spans = [seen.part_slice(part) for part in range(len(seen.parts))]
+    assert sizes == [min(span.stop - span.start, 3 * NEIGHBOURS) for span in spans]
+    assert min(sizes) < NEIGHBOURS  # some have fewer fragments than neighbours are asked for
+    for span, part in zip(spans, found.parts, strict=True):
+        assert ((part.at >= span.start) & (part.at < span.stop)).all()
     assert np.isfinite(found.frame(tables).image).all()
 
 

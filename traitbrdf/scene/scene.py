@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
 import numpy as np
@@ -25,7 +27,7 @@ GROUND = "ground"
 
 _GROUND_RADIUS = 2.0  # default, in radii of the shape
 RAYS_AT_ONCE = 1 << 16
-"""Rays in one call: some 15 ms during which no other thread can run."""
+"""Rays in one call, which takes some 15 ms; several calls run in parallel."""
 
 _CREASE = math.cos(math.radians(40.0))  # a border lies between normals that differ by more
 _JUMP = 3.0  # pixels; a border lies between pixels further off each other's plane
@@ -288,10 +290,14 @@ class Scene:
             )
         free = np.ones(len(index), dtype=bool)
         cast = self._cast_rows(index)
-        for rows in _chunks(len(index) if cast is None else len(cast)):
+
+        def shoot(rows: slice) -> None:
             chosen = rows if cast is None else cast[rows]
-            self.rays_cast += rows.stop - rows.start
             free[chosen] = ~self.shape.occluded(self.starts[index[chosen]], directions[chosen])
+
+        count = len(index) if cast is None else len(cast)
+        self.rays_cast += count
+        _in_parallel(shoot, _chunks(count))
         return free
 
     def arriving(self, light: Light, index: NDArray[np.integer]) -> tuple[Float64, Float64]:
@@ -432,7 +438,8 @@ class Scene:
             np.zeros((count, 3)),
             np.zeros((count, 3)),
         )
-        for rows in _chunks(count):
+
+        def shoot(rows: slice) -> None:
             rays = self.camera.through(self.height, self.width, x[rows], y[rows])
             found = self.shape.intersect(origin, rays)
             hits.part[rows] = found.part
@@ -441,6 +448,8 @@ class Scene:
             hits.start[rows] = found.start
             if self.ground:
                 self._shoot_ground(origin, rays, rows, hits)
+
+        _in_parallel(shoot, _chunks(count))
         return hits
 
     def _shoot_ground(self, origin: Float64, rays: Float64, rows: slice, hits: Hits) -> None:
@@ -487,6 +496,25 @@ class Scene:
             border[a] |= ends
             border[b] |= ends
         return border.ravel()
+
+
+def _threads() -> int:
+    """Return how many threads cast rays: one a core, unless OMP_NUM_THREADS says less."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    said = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores or 1, int(said) if said.isdecimal() and int(said) > 0 else 1 << 10)
+
+
+def _in_parallel(work: Callable[[slice], None], chunks: list[slice]) -> None:
+    """Work on all chunks; the tracer lets other threads run meanwhile."""
+    threads = min(_threads(), len(chunks))
+    if threads <= 1:
+        for rows in chunks:
+            work(rows)
+        return
+    with ThreadPoolExecutor(threads, "traitbrdf-rays") as pool:
+        for _ in pool.map(work, chunks):  # raises what one of them raised
+            pass
 
 
 def _chunks(count: int) -> list[slice]:

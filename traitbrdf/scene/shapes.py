@@ -499,6 +499,8 @@ class Mesh:
         # robust: a ray through a shared edge hits one of its two triangles
         scene = embreex.rtcore_scene.EmbreeScene(robust=True)
         embreex.mesh_construction.TriangleMesh(scene, self._local.astype(np.float32), self.faces)
+        # the first ray builds the tree, which several threads must not do at once
+        scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
         return scene
 
 

@@ -51,6 +51,12 @@ NODES = (1000, 4000)
 DRAFT_SIZE = 128
 """Pixels along the longer side of a draft."""
 
+UNIVERSAL = ("preview", "interactive")
+"""Qualities whose bases are made of the universal tables; others combine tables for each scene."""
+
+_UNIVERSAL = ("tables", "projection", "need", "typical")
+"""What is kept of a universal basis."""
+
 _CALIBRATED = 96
 """Materials on which a promise is measured."""
 
@@ -439,7 +445,11 @@ def _transport(
                 return Prepared(transport, True, some, transport)
     begin(report)
     report("tables", 0.0)
-    training = training_of(library, seed)
+    if settings.quality in UNIVERSAL:
+        basis = universal_basis(library, seed, cache, report)
+        training = Training(basis.tables, basis.need.astype(np.float64), combined=True)
+    else:
+        training = training_of(library, seed)
     report("tables", 0.0)
     if known is None:
         training = replace(training, fixed=tables)
@@ -466,25 +476,36 @@ def training_of(library: Library, seed: int) -> Training:
     return training_tables(np.concatenate(channels, axis=1), library.embedding.grid_, seed)
 
 
-def universal_basis(library: Library, seed: int, cache: Cache, report: Progress) -> UniversalBasis:
+def universal_basis(
+    library: Library, seed: int, cache: Cache | None, report: Progress
+) -> UniversalBasis:
     """Return the universal basis of a library: from the cache, or fitted and put there.
 
     Parameters
     ----------
     library : Library
     seed : int
-    cache : Cache
+    cache : Cache or None
+        None keeps it for this process alone.
     report : callable
         Is told of each stage and fraction.
     """
-    key, grid = universal_key(library, seed), library.embedding.grid_
-    arrays = cache.read(key) or {}
-    try:
-        return UniversalBasis(grid, arrays["tables"], arrays["projection"], arrays["typical"])
-    except KeyError:  # missing, or written by something else
-        report("universal basis", 0.0)
-        training = training_of(library, seed)
-        basis = UniversalBasis.fit(grid, training, seed=seed, progress=report)
-        names = ("tables", "projection", "typical")
-        cache.write_behind(key, {name: getattr(basis, name) for name in names})
-        return basis
+    grid = library.embedding.grid_
+    if cache is not None:
+        key = universal_key(library, seed)
+        arrays = cache.read(key) or {}
+        with contextlib.suppress(KeyError):  # missing, or written by something else
+            return UniversalBasis(grid, *(arrays[name] for name in _UNIVERSAL))
+    report("universal basis", 0.0)
+    training = training_of(library, seed)
+    known = [basis for made_of, basis in _FITTED if made_of is training]
+    if not known:
+        known = [UniversalBasis.fit(grid, training, seed=seed, progress=report)]
+        _FITTED[:] = [(training, known[0])]
+    if cache is not None:
+        cache.write_behind(key, {name: getattr(known[0], name) for name in _UNIVERSAL})
+    return known[0]
+
+
+_FITTED: list[tuple[Training, UniversalBasis]] = []
+"""The universal basis that was fitted last, and what it was fitted to."""

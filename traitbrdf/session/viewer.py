@@ -351,7 +351,7 @@ class Viewer:
                         seed=settings.seed, progress=report,
                     )  # fmt: skip
                 else:
-                    nodes = nodes.refined(count, tables, report)
+                    nodes = nodes.refined(count, tables, progress=report)
                 with lock:
                     view.nodes = nodes
 

@@ -122,11 +122,15 @@ class Training:
     fixed : tables (cells, 3) float32 by index into ``scene.parts``
         Parts that keep their material. A group of nothing else is prepared for these tables alone,
         which takes a fraction of the time; `Transport.freed` prepares it for all others.
+    combined : bool
+        Whether the tables are those of a `UniversalBasis`: then the first of them have the images
+        that a basis is made of. Otherwise they are combined anew for each scene.
     """
 
     tables: Float32
     weight: Float64
     fixed: Mapping[int, Float32] = field(default_factory=dict)
+    combined: bool = False
 
 
 def training_tables(library: Float32, grid: HalfDiffGrid, seed: int = 0) -> Training:

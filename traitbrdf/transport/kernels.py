@@ -292,22 +292,20 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def interpolate_images(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
-    """Interpolate images between the fragments where they were computed.
+    """Add images that are interpolated between the fragments where they were computed.
 
     Parameters
     ----------
-    out : (P, 3, T) float32, which is set
+    out : (P, 3, T) float32, to which they are added
     coarse : (K, 3, T) float32 radiance of the computed fragments
-    corners : (P, 4) int32 indices into `coarse`
-    weights : (P, 4) float32
+    corners : (P, k) int32 indices into `coarse`
+    weights : (P, k) float32
     """
     for p in numba.prange(len(out)):
-        for c in range(out.shape[1]):
-            for j in range(out.shape[2]):
-                out[p, c, j] = weights[p, 0] * coarse[corners[p, 0], c, j]
-            for k in range(1, 4):
-                if weights[p, k] != 0.0:
-                    w, q = weights[p, k], corners[p, k]
+        for k in range(corners.shape[1]):
+            w, q = weights[p, k], corners[p, k]
+            if w != 0.0:
+                for c in range(out.shape[1]):
                     for j in range(out.shape[2]):
                         out[p, c, j] += w * coarse[q, c, j]
 

@@ -7,7 +7,7 @@ frame is A (B (C rho)): linear in the table, within milliseconds, after some sec
 
 *Nodes.* Half of the first are drawn evenly. All others are drawn where the error of leaving a node
 out, times the distance to the next node, is large: at highlights, outlines of shadows and creases.
-`NodeTransport.refined` adds nodes.
+`NodeTransport.refined` adds nodes. Fragments of a part are interpolated from nodes of that part.
 
 *Error.* Some fragments, the probes, keep exact rows; comparing with them measures each frame.
 """
@@ -41,6 +41,12 @@ NEIGHBOURS = 8
 PROBES = 20
 """Fragments of a part that keep exact rows, to measure errors."""
 
+_LEAST = 3 * NEIGHBOURS
+"""Nodes of each part, however small it is."""
+
+_AT_ONCE = 4096
+"""Nodes whose images are computed between two reports of progress."""
+
 _OTHERS = 0.5
 """What errors of typical materials count, beside those of the present ones."""
 
@@ -63,20 +69,25 @@ class NodeFrame(NamedTuple):
     error: float
 
 
-class _Group(NamedTuple):
-    """Fragments that are interpolated from nodes among them.
+class Nodes(NamedTuple):
+    """The nodes of one part, and how its other fragments are interpolated from them.
 
     Attributes
     ----------
-    fragments : (P,) int64
-    nodes : (n,) int64, some of the fragments
+    at : (n,) int64
+        Fragments of the scene, in the order in which they were drawn.
     images : (n, 3, R) float32
         Radiance of nodes under the tables of the basis, as if they covered their pixel.
+    near : (P, k) int32
+        Nodes of the part that each of its fragments is interpolated from.
+    shares : (P, k) float32
+        Their weights, times the share of its pixel that the fragment covers.
     """
 
-    fragments: Int64
-    nodes: Int64
+    at: Int64
     images: Float32
+    near: NDArray[np.int32]
+    shares: Float32
 
 
 class NodeTransport:
@@ -101,9 +112,11 @@ class NodeTransport:
     Attributes
     ----------
     count : int
-        Number of nodes that was asked for; there are fewer in a small scene.
-    nodes : (n,) int64
-        Fragments at which images are computed.
+        Number of nodes that was asked for. There are fewer in a small scene, and some more if it
+        has small parts.
+    operator : Operator
+        What images are computed with.
+    parts : list of Nodes, one for each part
     """
 
     def __init__(
@@ -120,14 +133,14 @@ class NodeTransport:
         report = progress or (lambda stage, fraction: None)
         report("nodes", 0.0)
         self.scene, self.basis, self.count = scene, basis, count
-        self._operator = Operator(scene, basis.grid, resolution, tree)
+        self.operator = Operator(scene, basis.grid, resolution, tree)
         self._rng = np.random.default_rng(seed)
         self._places = _places(scene)
         spans = [scene.part_slice(part) for part in range(len(scene.parts))]
         self._probes = np.concatenate(
             [np.sort(s.start + self._rng.permutation(s.stop - s.start)[:PROBES]) for s in spans]
         )
-        rows = Operator(scene, basis.grid, 1.0, self._operator.tree).rows(self._probes)
+        rows = Operator(scene, basis.grid, 1.0, self.operator.tree).rows(self._probes)
         self._rows = torch.from_numpy(np.ascontiguousarray(rows.transpose(1, 0, 2)))
         self._projection = torch.from_numpy(np.ascontiguousarray(basis.projection))
         self._pixels = torch.from_numpy(scene.pixels)
@@ -135,13 +148,18 @@ class NodeTransport:
         self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop, dtype=np.float32))
         self._mirror: torch.Tensor | None = None
         none = np.zeros(0, np.int64), np.zeros((0, 3, basis.tables.shape[1]), np.float32)
-        self._groups = [_Group(fragments, *none) for fragments in _fragments(scene)]
+        nothing = np.zeros((0, NEIGHBOURS), np.int32), np.zeros((0, NEIGHBOURS), np.float32)
+        self.parts = [Nodes(*none, *nothing) for _ in spans]
         for most in (count // 2, count):
-            self._groups = [self._more(group, most, tables, report) for group in self._groups]
+            self._add(most, tables, report)
         self._join(report)
 
     def refined(
-        self, count: int, tables: Sequence[Float32], progress: Progress | None = None
+        self,
+        count: int,
+        tables: Sequence[Float32],
+        resolution: float | None = None,
+        progress: Progress | None = None,
     ) -> NodeTransport:
         """Return a transport with more nodes, those of this one included.
 
@@ -153,14 +171,24 @@ class NodeTransport:
             Number of nodes.
         tables : sequence of (cells, 3) float32, one for each part
             What the parts are made of at present.
+        resolution : float or None
+            As for `Operator`; all images are computed anew if it is another one.
         progress : called with (stage, fraction done); may raise to cancel
         """
         report = progress or (lambda stage, fraction: None)
         other = copy.copy(self)
-        other.count = count
-        other._groups = [self._more(group, count, tables, report) for group in self._groups]
+        other.count, other.parts = count, list(self.parts)
+        if resolution is not None and resolution != self.operator.resolution:
+            other.operator = Operator(self.scene, self.basis.grid, resolution, self.operator.tree)
+            other._compute([part.at for part in self.parts], report, anew=True)
+        other._add(count, tables, report)
         other._join(report)
         return other
+
+    @property
+    def nodes(self) -> Int64:
+        """Fragments at which images are computed."""
+        return np.concatenate([part.at for part in self.parts])
 
     def frame(
         self, tables: Sequence[Float32], mirrors: Sequence[Float64] | None = None
@@ -184,11 +212,12 @@ class NodeTransport:
                 continue
             if id(table) not in known:
                 columns = torch.from_numpy(table).T.contiguous()
-                at_nodes = [self._images[c] @ (self._projection @ columns[c]) for c in range(3)]
-                known[id(table)] = columns, torch.stack(at_nodes, dim=1)
-            columns, shown = known[id(table)]
+                known[id(table)] = columns, torch.stack([self._projection @ c for c in columns])
+            columns, coefficients = known[id(table)]
+            images, near, shares = self._read[part]
+            shown = torch.stack([images[c] @ coefficients[c] for c in range(3)], dim=1)
             radiance[span] = torch.nn.functional.embedding_bag(
-                self._near[span], shown, per_sample_weights=self._weights[span], mode="sum"
+                near, shown, per_sample_weights=shares, mode="sum"
             ).clamp_min_(0.0)
             probes = slice(*np.searchsorted(self._probes, (span.start, span.stop)).tolist())
             exact = torch.stack([self._rows[c, probes] @ columns[c] for c in range(3)], dim=1)
@@ -198,7 +227,7 @@ class NodeTransport:
             level += stands_for * float(exact.sum())
         if mirrors is not None and any(np.any(m) for m in mirrors):
             if self._mirror is None:
-                self._mirror = torch.from_numpy(self._operator.mirror(np.arange(len(radiance))))
+                self._mirror = torch.from_numpy(self.operator.mirror(np.arange(len(radiance))))
             weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[scene.pixel_part]
             radiance += torch.from_numpy(weight) * self._mirror
         image = self._backdrop.clone().index_add_(0, self._pixels, radiance)
@@ -207,67 +236,91 @@ class NodeTransport:
 
     # -- nodes ----------------------------------------------------------------------------------
 
-    def _more(
-        self, group: _Group, count: int, tables: Sequence[Float32], report: Progress
-    ) -> _Group:
-        """Draw more nodes of a group, of `count` in the whole scene, and compute their images."""
-        fragments, nodes, images = group
-        whole = len(self.scene.pixels)
-        most = min(max(1, round(count * len(fragments) / whole)), len(fragments))
-        score = np.ones(len(fragments))
-        if len(nodes) > NEIGHBOURS:
-            tree = cKDTree(self._places[nodes])
-            away, nearest = tree.query(self._places[fragments], 1, workers=-1)
-            parts = np.unique(self.scene.pixel_part[fragments])
-            shown = {id(tables[part]): tables[part] for part in parts}.values()
-            own = [self.basis.projection @ one for one in shown]
+    def _add(self, count: int, tables: Sequence[Float32], report: Progress) -> None:
+        """Draw nodes, until there are `count` in the scene, and compute their images."""
+        shape = range(len(self.scene.shape.parts))
+        ground = range(len(shape), len(self.parts))
+        fresh = [np.zeros(0, np.int64) for _ in self.parts]
+        # errors on the ground do not compare with those on the shape: each has its share of nodes
+        for group in (shape, ground):
+            spans = [self.scene.part_slice(part) for part in group]
+            size = sum(span.stop - span.start for span in spans)
+            if not size:
+                continue
+            most = round(count * size / max(len(self.scene.pixels), 1))
+            have = sum(len(self.parts[part].at) for part in group)
+            scores = [self._score(part, tables[part]) for part in group]
+            whole = np.concatenate(scores)
+            drawn = min(max(most, 1) - have, int(np.count_nonzero(whole)))
+            if drawn > 0:
+                # what is drawn has no order among places: any few of them are spread evenly
+                chosen = self._rng.choice(size, drawn, replace=False, p=whole / whole.sum())
+                for part, span in zip(group, spans, strict=True):
+                    at = chosen + spans[0].start
+                    fresh[part] = at[(at >= span.start) & (at < span.stop)]
+            for part, span in zip(group, spans, strict=True):
+                lacking = min(_LEAST, span.stop - span.start) - len(self.parts[part].at)
+                lacking -= len(fresh[part])
+                if lacking > 0:
+                    known = np.concatenate([self.parts[part].at, fresh[part]])
+                    free = np.setdiff1d(np.arange(span.start, span.stop), known)
+                    more = self._rng.choice(free, lacking, replace=False)
+                    fresh[part] = np.concatenate([fresh[part], more])
+        self._compute(fresh, report)
+
+    def _compute(self, fresh: Sequence[Int64], report: Progress, anew: bool = False) -> None:
+        """Compute images at fragments of each part, beside the known ones or in their place."""
+        done, whole = 0, max(sum(map(len, fresh)), 1)
+        for part, at in enumerate(fresh):
+            known = self.parts[part]
+            self.operator.cast(at, self._places)
+            images = [] if anew else [known.images]
+            for some in np.array_split(at, len(at) // _AT_ONCE + 1):
+                found = self.operator.images(some, self.basis.tables, self.operator.core)
+                found /= self.scene.weights[some].astype(np.float32)[:, None, None]
+                images.append(found)
+                done += len(some)
+                report("nodes", 0.9 * done / whole)
+            nodes = at if anew else np.concatenate([known.at, at])
+            self.parts[part] = known._replace(at=nodes, images=np.concatenate(images))
+
+    def _score(self, part: int, table: Float32) -> NDArray[np.float64]:
+        """Return how much a part's fragments (P,) need a node: 0 for those that are one."""
+        known, span = self.parts[part], self.scene.part_slice(part)
+        score = np.ones(span.stop - span.start)
+        if len(known.at) > NEIGHBOURS:
+            places = self._places
+            away, nearest = cKDTree(places[known.at]).query(places[span], 1, workers=-1)
+            own = self.basis.projection @ table
             typical = self.basis.typical[:, :, None].repeat(3, axis=2).transpose(1, 0, 2)
             # materials may change: a share of the nodes goes where others would need them
-            error = self._left_out(nodes, images, own) / max(len(own), 1)
-            error += _OTHERS * self._left_out(nodes, images, list(typical)) / len(typical)
+            error = self._left_out(known, [own])
+            error += _OTHERS * self._left_out(known, list(typical)) / len(typical)
             score = (error[nearest] + _EVEN * error.mean()) * away
-        score[np.searchsorted(fragments, nodes)] = 0.0
-        drawn = min(most - len(nodes), int(np.count_nonzero(score)))
-        if drawn <= 0:
-            return group
-        chosen = self._rng.choice(len(fragments), drawn, replace=False, p=score / score.sum())
-        fresh = fragments[np.sort(chosen)]
-        found = self._operator.images(fresh, self.basis.tables)
-        found /= self.scene.weights[fresh].astype(np.float32)[:, None, None]
-        report("nodes", 0.8 * float(fragments[-1]) / whole)
-        return _Group(fragments, np.concatenate([nodes, fresh]), np.concatenate([images, found]))
+        score[known.at - span.start] = 0.0
+        return score
 
     def _join(self, report: Progress) -> None:
-        """Collect what frames read of all groups."""
-        report("nodes", 0.8)
-        none = np.zeros(0, np.int64), np.zeros((0, 3, self.basis.tables.shape[1]), np.float32)
-        nodes, images = [none[0]], [none[1]]
-        near = [np.zeros((0, NEIGHBOURS), np.int64)]
-        weights = [np.zeros((0, NEIGHBOURS), np.float32)]
-        for group in self._groups:
-            at, share = self._kriging(group.fragments, group.nodes)
-            missing = ((0, 0), (0, NEIGHBOURS - at.shape[1]))
-            near.append(np.pad(at + sum(map(len, nodes)), missing, "edge"))
-            weights.append(np.pad(share, missing))
-            nodes.append(group.nodes)
-            images.append(group.images)
-        self.nodes = np.concatenate(nodes)
-        whole = np.concatenate(images).transpose(1, 0, 2)
-        self._images = torch.from_numpy(np.ascontiguousarray(whole))
-        self._near = torch.from_numpy(np.concatenate(near).astype(np.int32))
-        # a fragment shows the share of its pixel that it covers
-        covered = self.scene.weights[:, None].astype(np.float32)
-        self._weights = torch.from_numpy(np.concatenate(weights) * covered)
+        """Prepare the interpolation, and what frames read."""
+        report("nodes", 0.9)
+        self._read: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+        for part, nodes in enumerate(self.parts):
+            span = self.scene.part_slice(part)
+            at, shares = self._kriging(np.arange(span.start, span.stop), nodes.at)
+            # a fragment shows the share of its pixel that it covers
+            shares *= self.scene.weights[span, None].astype(np.float32)
+            self.parts[part] = nodes._replace(near=at.astype(np.int32), shares=shares)
+            images = np.ascontiguousarray(nodes.images.transpose(1, 0, 2))
+            near = torch.from_numpy(self.parts[part].near)
+            self._read.append((torch.from_numpy(images), near, torch.from_numpy(shares)))
         report("nodes", 1.0)
 
-    def _left_out(
-        self, nodes: Int64, images: Float32, shown: Sequence[Float32]
-    ) -> NDArray[np.float64]:
+    def _left_out(self, nodes: Nodes, shown: Sequence[Float32]) -> NDArray[np.float64]:
         """Return each node's relative error (n,) if it is interpolated from the others."""
-        near, weights = self._kriging(nodes, nodes, leave_out=True)
-        error = np.full(len(nodes), 1e-12)
+        near, weights = self._kriging(nodes.at, nodes.at, leave_out=True)
+        error = np.full(len(nodes.at), 1e-12)
         for coefficients in shown:
-            radiance = np.einsum("ncr,rc->nc", images, coefficients)
+            radiance = np.einsum("ncr,rc->nc", nodes.images, coefficients)
             found = np.einsum("nk,nkc->nc", weights, radiance[near])
             error += np.abs(found - radiance).mean(axis=1) / max(float(radiance.mean()), 1e-30)
         return error
@@ -275,20 +328,13 @@ class NodeTransport:
     def _kriging(self, at: Int64, nodes: Int64, leave_out: bool = False) -> tuple[Int64, Float32]:
         places = self._places
         count = min(NEIGHBOURS, len(nodes) - leave_out)
+        if not count:
+            return np.zeros((len(at), 0), np.int64), np.zeros((len(at), 0), np.float32)
         _, near = cKDTree(places[nodes]).query(places[at], count + leave_out, workers=-1)
         near = near.reshape(len(at), -1)[:, int(leave_out) :].astype(np.int64)
         weights = np.empty(near.shape, np.float32)
         kriging_weights(weights, places[nodes], places[at], np.ascontiguousarray(near))
         return near, weights
-
-
-def _fragments(scene: Scene) -> list[Int64]:
-    """Return the fragments of the shape, and those of the ground: these groups do not mix."""
-    spans = [scene.part_slice(part) for part in range(len(scene.parts))]
-    count = len(scene.shape.parts)
-    groups = [group for group in (spans[:count], spans[count:]) if group]
-    found = [np.arange(group[0].start, group[-1].stop) for group in groups]
-    return [fragments for fragments in found if len(fragments)]
 
 
 def _places(scene: Scene) -> Float32:

@@ -34,10 +34,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from traitbrdf.directions import reflect
 from traitbrdf.reflectance.brdf import HalfDiffGrid
@@ -93,6 +94,9 @@ SHARPEST = 1e-4
 _SHARED = ((4, 0.002), (2, 0.007))
 """Side in pixels of blocks that share one walk, and how far their half vectors may differ in
 radians."""
+
+_FIRST = 1000
+"""Scattered fragments that cast all of their rays, before others take over what they see."""
 
 _UNITED = 0.007
 """How far the half vectors of the samples of a fragment may differ for one walk, in radians."""
@@ -245,7 +249,9 @@ class Operator:
         self._add_lights(out, at, _NO_TABLES)
         return out
 
-    def images(self, index: NDArray[np.integer], tables: Float32) -> Float32:
+    def images(
+        self, index: NDArray[np.integer], tables: Float32, core: float | None = None
+    ) -> Float32:
         """Compute the radiance (m, 3, T) float32 of fragments under scalar tables.
 
         Parameters
@@ -253,11 +259,15 @@ class Operator:
         index : (m,) int
             Fragments of the scene.
         tables : (grid.size, T) float32, in 1/sr
+        core : float or None
+            Half the width in theta_h, in radians, of the narrowest peak that is resolved; None is
+            that of the tables. With the operator's own, these are `rows` times the tables.
         """
         at = np.asarray(index, np.int64)
         tables = np.ascontiguousarray(tables, np.float32)
         out = np.zeros((len(at), 3, tables.shape[1]), np.float32)
-        self._shade(out, at, self._mask_rows(at), _Lobes(core=self._core_of(tables)), tables)
+        lobes = _Lobes(core=self._core_of(tables) if core is None else core)
+        self._shade(out, at, self._mask_rows(at), lobes, tables)
         self._add_lights(out, at, tables)
         return out
 
@@ -328,7 +338,7 @@ class Operator:
             coarse, computed, self._own_rows(computed), far, wide,
             lambda fraction: report("far images", fraction),
         )  # fmt: skip
-        out = np.empty((len(index), 3, tables.shape[1]), np.float32)
+        out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
         interpolate_images(out, coarse, plan.corners, plan.weights)
         if not broad:
             self._shade(
@@ -531,8 +541,7 @@ class Operator:
         visibility = self.visibility
         if visibility is None or not len(index):
             return self._own_rows(index)
-        casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
-        unknown = np.unique(index[casts & (visibility.row_of[index] < 0)])
+        unknown = self._without_rows(index)
         if len(unknown):
             around = np.full((len(unknown), 4), -1, np.int32)
             for part, plan in list(self._plans.items()):
@@ -542,6 +551,43 @@ class Operator:
             visibility.cast(unknown, around, least=3)
             visibility.cast_samples(unknown, self.resolution > 1.0)
         return self._own_rows(index)
+
+    def _without_rows(self, index: Int64) -> Int64:
+        """Return those of fragments (m,), sorted, that need rays and have cast none."""
+        if self.visibility is None:
+            return np.zeros(0, np.int64)
+        casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
+        return np.unique(index[casts & (self.visibility.row_of[index] < 0)])
+
+    def cast(self, index: Int64, places: NDArray[np.floating[Any]]) -> None:
+        """Cast the rays of scattered fragments: fewer than `images` would where places are near.
+
+        A few fragments cast all rays. Of the others, twice as many each time, each takes over that
+        on which the four nearest agree.
+
+        Parameters
+        ----------
+        index : (m,) int64
+            Fragments, in random order, none twice.
+        places : (fragments, d) float
+            Where all fragments of the scene lie; near ones see the same.
+        """
+        visibility = self.visibility
+        if visibility is None or not len(index):
+            return
+        known = index[visibility.row_of[index] >= 0]
+        missing = index[np.isin(index, self._without_rows(index))]
+        done = 0
+        while done < len(missing):
+            fresh = missing[done : done + max(len(known), _FIRST)]
+            around = np.full((len(fresh), 4), -1, np.int32)
+            if len(known) >= _FIRST:
+                _, near = cKDTree(places[known]).query(places[fresh], 4, workers=-1)
+                around = visibility.row_of[known[near]]
+            visibility.cast(fresh, around, 4, verify=True)
+            visibility.cast_samples(fresh, self.resolution > 1.0)
+            known = np.concatenate([known, fresh])
+            done += len(fresh)
 
     def prepare(self, part: int, progress: Progress | None = None) -> None:
         """Cast a part's rays and choose where its far images are computed, unless that is done.

@@ -326,7 +326,11 @@ class Transport:
                             mix = np.unique(some, axis=1)
                             need = np.ones(mix.shape[1])
                         else:
-                            mix, need = self._combinations(group, tables, importance, rng)
+                            if training.combined:
+                                mix = np.ascontiguousarray(training.tables[:, : self._tables])
+                                need = training.weight[: self._tables]
+                            else:
+                                mix, need = self._combinations(group, tables, importance, rng)
                         basis = self._compress(group, mix, need, rng, casting, report)
                     self.bases.append(basis)
             finally:
@@ -374,6 +378,11 @@ class Transport:
         self._probe_operator: Operator | None = None
         backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
         self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop)).to(self.device)
+
+    @property
+    def _tables(self) -> int:
+        """Most tables whose images a basis is made of."""
+        return self.rank if self.grey else math.ceil(self.TABLES * self.rank)
 
     @property
     def operator(self) -> Operator:
@@ -492,7 +501,7 @@ class Transport:
         images = images * weight
         # eigenvectors of the small Gram matrix: an SVD is slow where singular values underflow
         squares, u = torch.linalg.eigh(images @ images.T)
-        count = min(self.rank if self.grey else math.ceil(self.TABLES * self.rank), len(squares))
+        count = min(self._tables, len(squares))
         enough = squares.flip(0) > (0.1 * self.ENOUGH) ** 2 * squares[-1]
         count = max(1, min(count, int(enough.sum())))
         squares, u = squares.flip(0)[:count], u.flip(1)[:, :count]

@@ -59,6 +59,8 @@ class UniversalBasis:
         M, in 1/sr; combinations of BRDFs, so that they may be negative.
     projection : (R, cells) float32
         C: takes a channel of a table to its coefficients.
+    need : (R,) float32
+        How much each table counts in frames: the singular values.
     typical : (R, 3) float32
         Coefficients of a mirror-like, a glossy and a diffuse table.
     """
@@ -66,6 +68,7 @@ class UniversalBasis:
     grid: HalfDiffGrid
     tables: Float32
     projection: Float32
+    need: Float32
     typical: Float32
 
     @classmethod
@@ -127,7 +130,8 @@ class UniversalBasis:
         wi, wo = grid.node_directions()
         some = [model.eval(wi, wo)[..., 1].ravel() for model in _TYPICAL]
         typical = projection @ torch.from_numpy(np.stack(some, axis=1).astype(np.float32))
-        return cls(grid, found_tables.numpy(), projection.numpy(), typical.numpy())
+        need = squares.sqrt().float().numpy()
+        return cls(grid, found_tables.numpy(), projection.numpy(), need, typical.numpy())
 
 
 def _views(rng: np.random.Generator) -> Iterator[Scene]:

@@ -407,7 +407,7 @@ class Visibility:
         """Append rows of bits, and return their numbers."""
         need = self.rows + len(bits)
         if need > len(self._bits):
-            size = max(need, len(self._bits) * 5 // 4)
+            size = max(need, 2 * len(self._bits))  # memory that nobody writes to costs nothing
             self._bits = _grown(self._bits, size)
             self._masks = tuple(_grown(a, size) for a in self._masks)
         rows = slice(self.rows, need)
@@ -423,8 +423,8 @@ class Visibility:
 
 
 def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
-    """Return a copy of an array with zeros up to `size` rows."""
-    larger = np.zeros((size, array.shape[1]), array.dtype)
+    """Return a copy of an array with room for `size` rows."""
+    larger = np.empty((size, array.shape[1]), array.dtype)
     larger[: len(array)] = array
     return larger
 
