@@ -127,6 +127,28 @@ class Camera:
         ray /= np.sqrt(dots(ray, ray))[..., None]
         return ray
 
+    def project(self, shape: Shape, height: int, width: int, points: Float64) -> Float64:
+        """Return the image positions (..., 2) of world points: x, y as `through` takes them.
+
+        Parameters
+        ----------
+        shape : Shape
+            The shape that the camera looks at.
+        height, width : int
+            Pixels of the image.
+        points : (..., 3) array
+            Points behind the camera have no position: theirs are NaN.
+        """
+        a = math.radians(self.azimuth)
+        right = np.array([math.cos(a), 0.0, -math.sin(a)])
+        up = np.cross(self._back, right)
+        offset = points - self.position(shape, height, width)
+        depth = -(offset @ self._back)
+        scale = height / (2.0 * self._slope) / np.where(depth > 0.0, depth, np.nan)
+        x = width / 2 + (offset @ right) * scale
+        position: Float64 = np.stack([x, height / 2 - (offset @ up) * scale], axis=-1)
+        return position
+
     @property
     def _slope(self) -> float:
         """Tangent of half the vertical field of view."""

@@ -28,6 +28,7 @@ from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.kernels import kriging_weights
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import Operator
+from traitbrdf.transport.reflections import reflections, regression
 from traitbrdf.transport.universal import UniversalBasis
 from traitbrdf.transport.visibility import Progress
 
@@ -82,12 +83,37 @@ class Nodes(NamedTuple):
         Nodes of the part that each of its fragments is interpolated from.
     shares : (P, k) float32
         Their weights, times the share of its pixel that the fragment covers.
+    slopes : (3, D, n) float32
+        Takes the radiance of the nodes to the coefficients of the reflections around them.
+    left_out : pair of (n, k) int64 and (n, k) float32
+        The nodes that each node is interpolated from if it is left out, and their weights.
     """
 
     at: Int64
     images: Float32
     near: NDArray[np.int32]
     shares: Float32
+    slopes: Float32
+    left_out: tuple[Int64, Float32]
+
+
+class _Read(NamedTuple):
+    """What a frame reads of a part, as tensors; see `Nodes`.
+
+    Attributes
+    ----------
+    images : (3, n, R) float32
+    near : (P, k) int32
+    shares : (P, k) float32
+    slopes : (3, D, n) float32
+    columns : (3, P, D) float32
+    """
+
+    images: torch.Tensor
+    near: torch.Tensor
+    shares: torch.Tensor
+    slopes: torch.Tensor
+    columns: torch.Tensor
 
 
 class NodeTransport:
@@ -135,7 +161,7 @@ class NodeTransport:
         self.scene, self.basis, self.count = scene, basis, count
         self.operator = Operator(scene, basis.grid, resolution, tree)
         self._rng = np.random.default_rng(seed)
-        self._places = _places(scene)
+        self._places = places_of(scene)
         spans = [scene.part_slice(part) for part in range(len(scene.parts))]
         self._probes = np.concatenate(
             [np.sort(s.start + self._rng.permutation(s.stop - s.start)[:PROBES]) for s in spans]
@@ -147,9 +173,11 @@ class NodeTransport:
         backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
         self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop, dtype=np.float32))
         self._mirror: torch.Tensor | None = None
+        self._columns = reflections(scene)
         none = np.zeros(0, np.int64), np.zeros((0, 3, basis.tables.shape[1]), np.float32)
         nothing = np.zeros((0, NEIGHBOURS), np.int32), np.zeros((0, NEIGHBOURS), np.float32)
-        self.parts = [Nodes(*none, *nothing) for _ in spans]
+        slopes, alone = np.zeros((3, self._columns.shape[2], 0), np.float32), (none[0], none[1])
+        self.parts = [Nodes(*none, *nothing, slopes, alone) for _ in spans]
         for most in (count // 2, count):
             self._add(most, tables, report)
         self._join(report)
@@ -211,16 +239,20 @@ class NodeTransport:
             if span.start == span.stop:
                 continue
             if id(table) not in known:
-                columns = torch.from_numpy(table).T.contiguous()
-                known[id(table)] = columns, torch.stack([self._projection @ c for c in columns])
-            columns, coefficients = known[id(table)]
-            images, near, shares = self._read[part]
-            shown = torch.stack([images[c] @ coefficients[c] for c in range(3)], dim=1)
-            radiance[span] = torch.nn.functional.embedding_bag(
-                near, shown, per_sample_weights=shares, mode="sum"
-            ).clamp_min_(0.0)
+                cells = torch.from_numpy(table).T.contiguous()
+                known[id(table)] = cells, torch.stack([self._projection @ c for c in cells])
+            cells, coefficients = known[id(table)]
+            images, near, shares, slopes, columns = self._read[part]
+            shown = torch.bmm(images, coefficients[:, :, None])
+            slope = torch.bmm(slopes, shown)  # (3, D, 1)
+            shown -= torch.bmm(columns[:, self._at[part]], slope)
+            smooth = torch.nn.functional.embedding_bag(
+                near, shown[..., 0].T.contiguous(), per_sample_weights=shares, mode="sum"
+            )
+            smooth += self._covered[span] * torch.bmm(columns, slope)[..., 0].T
+            radiance[span] = smooth.clamp_min_(0.0)
             probes = slice(*np.searchsorted(self._probes, (span.start, span.stop)).tolist())
-            exact = torch.stack([self._rows[c, probes] @ columns[c] for c in range(3)], dim=1)
+            exact = torch.stack([self._rows[c, probes] @ cells[c] for c in range(3)], dim=1)
             stands_for = (span.stop - span.start) / len(exact)
             found = radiance[self._probes[probes]]
             deviation += stands_for * float((found - exact).abs().sum())
@@ -282,6 +314,10 @@ class NodeTransport:
                 done += len(some)
                 report("nodes", 0.9 * done / whole)
             nodes = at if anew else np.concatenate([known.at, at])
+            if len(nodes) > len(known.at):
+                left_out = kriging(self._places, nodes, nodes, NEIGHBOURS, leave_out=True)
+                slopes = regression(self._columns[nodes], *left_out)
+                known = known._replace(slopes=slopes, left_out=left_out)
             self.parts[part] = known._replace(at=nodes, images=np.concatenate(images))
 
     def _score(self, part: int, table: Float32) -> NDArray[np.float64]:
@@ -303,41 +339,69 @@ class NodeTransport:
     def _join(self, report: Progress) -> None:
         """Prepare the interpolation, and what frames read."""
         report("nodes", 0.9)
-        self._read: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
+        self._read = []
+        covered = self.scene.weights.astype(np.float32)
         for part, nodes in enumerate(self.parts):
             span = self.scene.part_slice(part)
-            at, shares = self._kriging(np.arange(span.start, span.stop), nodes.at)
+            every = np.arange(span.start, span.stop)
+            at, shares = kriging(self._places, nodes.at, every, NEIGHBOURS)
             # a fragment shows the share of its pixel that it covers
-            shares *= self.scene.weights[span, None].astype(np.float32)
+            shares *= covered[span, None]
             self.parts[part] = nodes._replace(near=at.astype(np.int32), shares=shares)
             images = np.ascontiguousarray(nodes.images.transpose(1, 0, 2))
-            near = torch.from_numpy(self.parts[part].near)
-            self._read.append((torch.from_numpy(images), near, torch.from_numpy(shares)))
+            columns = np.ascontiguousarray(self._columns[span].transpose(1, 0, 2))
+            read = images, self.parts[part].near, shares, nodes.slopes, columns
+            self._read.append(_Read(*(torch.from_numpy(a) for a in read)))
+        self._at = [
+            torch.from_numpy(nodes.at - self.scene.part_slice(part).start)
+            for part, nodes in enumerate(self.parts)
+        ]
+        self._covered = torch.from_numpy(covered)[:, None]
         report("nodes", 1.0)
 
     def _left_out(self, nodes: Nodes, shown: Sequence[Float32]) -> NDArray[np.float64]:
         """Return each node's relative error (n,) if it is interpolated from the others."""
-        near, weights = self._kriging(nodes.at, nodes.at, leave_out=True)
+        near, weights = nodes.left_out
+        columns = self._columns[nodes.at]
         error = np.full(len(nodes.at), 1e-12)
         for coefficients in shown:
             radiance = np.einsum("ncr,rc->nc", nodes.images, coefficients)
-            found = np.einsum("nk,nkc->nc", weights, radiance[near])
-            error += np.abs(found - radiance).mean(axis=1) / max(float(radiance.mean()), 1e-30)
+            slope = np.einsum("cdn,nc->cd", nodes.slopes, radiance)
+            rest = radiance - np.einsum("ncd,cd->nc", columns, slope)
+            found = np.einsum("nk,nkc->nc", weights, rest[near])
+            error += np.abs(found - rest).mean(axis=1) / max(float(radiance.mean()), 1e-30)
         return error
 
-    def _kriging(self, at: Int64, nodes: Int64, leave_out: bool = False) -> tuple[Int64, Float32]:
-        places = self._places
-        count = min(NEIGHBOURS, len(nodes) - leave_out)
-        if not count:
-            return np.zeros((len(at), 0), np.int64), np.zeros((len(at), 0), np.float32)
-        _, near = cKDTree(places[nodes]).query(places[at], count + leave_out, workers=-1)
-        near = near.reshape(len(at), -1)[:, int(leave_out) :].astype(np.int64)
-        weights = np.empty(near.shape, np.float32)
-        kriging_weights(weights, places[nodes], places[at], np.ascontiguousarray(near))
-        return near, weights
+
+def kriging(
+    places: Float32, nodes: Int64, at: Int64, neighbours: int, leave_out: bool = False
+) -> tuple[Int64, Float32]:
+    """Find the nodes that fragments are interpolated from, and their weights, both (m, k).
+
+    Parameters
+    ----------
+    places : (fragments, d) float32
+        Where fragments lie.
+    nodes : (n,) int64
+        Fragments that are known.
+    at : (m,) int64
+        Fragments to interpolate at.
+    neighbours : int
+        k, or the number of nodes if that is smaller.
+    leave_out : bool
+        Whether `at` are the nodes, each of which is to be interpolated from the others.
+    """
+    count = min(neighbours, len(nodes) - leave_out)
+    if not count:
+        return np.zeros((len(at), 0), np.int64), np.zeros((len(at), 0), np.float32)
+    _, near = cKDTree(places[nodes]).query(places[at], count + leave_out, workers=-1)
+    near = near.reshape(len(at), -1)[:, int(leave_out) :].astype(np.int64)
+    weights = np.empty(near.shape, np.float32)
+    kriging_weights(weights, places[nodes], places[at], np.ascontiguousarray(near))
+    return near, weights
 
 
-def _places(scene: Scene) -> Float32:
+def places_of(scene: Scene) -> Float32:
     """Return where fragments lie (P, 9): twice their position in radii, normal, mirror direction.
 
     What they show under any table and light depends on these.

@@ -1,0 +1,228 @@
+"""Glances: small frames of the real materials, while a camera or a light is moved.
+
+A frame at nodes (`traitbrdf.transport.nodes`) for one material takes a tenth of a second if it has
+few nodes. Nodes are points of the surface. Those that are still seen stay from frame to frame, so
+that the picture does not flicker; a few leave where the frame is smooth, and others come where
+leaving one out would show. Under a light that turns, the interpolation stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from traitbrdf.reflectance.brdf import HalfDiffGrid
+from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.nodes import NodeFrame, kriging, places_of
+from traitbrdf.transport.operator import Operator
+from traitbrdf.transport.reflections import reflections, regression
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+NODES = 500
+"""Nodes of a frame."""
+
+NEIGHBOURS = 5
+"""Nodes that a fragment is interpolated from."""
+
+RESOLUTION = 0.15
+"""Of the light, as for `Operator`."""
+
+PROBES = (24, 0.5)
+"""Fragments that measure the error, and the resolution of the light there."""
+
+_NEW = 0.15
+"""Share of the nodes that leave and come at each frame."""
+
+_CANDIDATES = 4000
+"""Fragments of which the new nodes are chosen."""
+
+_EVEN = 0.1
+"""Share of the mean error that every place counts as having, so that none is left out."""
+
+_APART = 100.0
+"""How far parts lie from each other: far more than any two fragments of one part."""
+
+
+class _Nodes(NamedTuple):
+    """The nodes of the last frame.
+
+    Attributes
+    ----------
+    at : (n,) int64, fragments of the small scene
+    near : (P, k) int32 tensor, the nodes that each fragment is interpolated from
+    weights : (P, k) float32 tensor
+    error : (n,) float64, of each node if it is interpolated from the others
+    """
+
+    at: Int64
+    near: torch.Tensor
+    weights: torch.Tensor
+    error: Float64
+
+
+class Glances:
+    """Makes small frames of scenes that differ in camera or light.
+
+    Parameters
+    ----------
+    grid : HalfDiffGrid of the tables
+    size : int
+        Pixels along the longer side, or the scene's own number if that is smaller.
+    seed : int
+        Draws nodes and probes.
+    """
+
+    def __init__(self, grid: HalfDiffGrid, size: int = 256, seed: int = 0) -> None:
+        self.grid, self.size = grid, size
+        self._rng = np.random.default_rng(seed)
+        self._of: Scene | None = None
+        self._scene: Scene | None = None
+        self._places: Float32 | None = None
+        self._nodes: _Nodes | None = None
+
+    def frame(
+        self,
+        scene: Scene,
+        tables: Sequence[Float32],
+        mirrors: Sequence[Float64] | None = None,
+        tree: LightTree | None = None,
+    ) -> NodeFrame:
+        """Render a small frame (h, w, 3), and measure its error.
+
+        Parameters
+        ----------
+        scene : Scene
+            At its full size.
+        tables : sequence of (cells, 3) float32, one for each part
+            f_r in 1/sr.
+        mirrors : sequence of (3,) or None
+            Weight of a perfect mirror beside each table.
+        tree : LightTree or None
+            The tree of the scene's map, if it was built before.
+        """
+        small, places, nodes = self._seen(scene)
+        operator = Operator(small, self.grid, RESOLUTION, tree)
+        count = len(small.pixels)
+        shown = np.zeros((len(nodes.at), 3), np.float32)
+        probes = np.sort(self._rng.choice(count, min(PROBES[0], count), replace=False))
+        finer = Operator(small, self.grid, PROBES[1], operator.tree)
+        exact = np.zeros((len(probes), 3), np.float32)
+        for one in {id(table): table for table in tables}.values():
+            parts = np.array([table is one for table in tables])
+            for at, out, by in ((nodes.at, shown, operator), (probes, exact, finer)):
+                mine = np.flatnonzero(parts[small.pixel_part[at]])
+                if len(mine):
+                    images = by.images(at[mine], one, by.core)
+                    out[mine] = np.einsum("pcc->pc", images) / small.weights[at[mine], None]
+        columns = reflections(small)
+        known, weights = kriging(places, nodes.at, nodes.at, NEIGHBOURS, leave_out=True)
+        drift = np.zeros((count, 3), np.float32)
+        for part in range(len(tables)):
+            span = small.part_slice(part)
+            mine = np.flatnonzero(small.pixel_part[nodes.at] == part)
+            if not len(mine):
+                continue
+            order = np.searchsorted(mine, known[mine])
+            fitted = regression(columns[nodes.at[mine]], order, weights[mine])
+            slope = np.einsum("cdn,nc->cd", fitted, shown[mine])
+            drift[span] = np.einsum("pcd,cd->pc", columns[span], slope)
+        shown -= drift[nodes.at]
+        radiance = torch.nn.functional.embedding_bag(
+            nodes.near, torch.from_numpy(shown), per_sample_weights=nodes.weights, mode="sum"
+        ).numpy()  # fmt: skip
+        radiance = np.maximum(radiance + drift, 0.0)
+        deviation, level = float(np.abs(radiance[probes] - exact).sum()), float(exact.sum())
+        left_out = np.einsum("nk,nkc->nc", weights, shown[known]) if known.shape[1] else 0.0
+        self._nodes = nodes._replace(error=np.abs(left_out - shown).mean(axis=1))
+        if mirrors is not None and any(np.any(m) for m in mirrors):
+            weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[small.pixel_part]
+            radiance = radiance + weight * operator.mirror(np.arange(count))
+        image = small.backdrop().reshape(-1, 3) * small.uncovered[:, None]
+        covered = radiance * small.weights[:, None].astype(np.float32)
+        if np.any(np.diff(np.sort(small.pixels)) == 0):
+            np.add.at(image, small.pixels, covered)
+        else:
+            image[small.pixels] += covered
+        frame = image.reshape(small.height, small.width, 3).astype(np.float32)
+        return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
+
+    def _seen(self, scene: Scene) -> tuple[Scene, Float32, _Nodes]:
+        """Return the scene at a small size, where its fragments lie, and nodes."""
+        last, known = self._scene, self._nodes
+        same = self._of is not None and _same_view(self._of, scene)
+        if same and last is not None and known is not None and self._places is not None:
+            light = {name: getattr(scene, name) for name in ("environment", "lights", "shadows")}
+            self._of, self._scene = scene, last.changed(**light)
+            return self._scene, self._places, known
+        scale = min(1.0, self.size / max(scene.height, scene.width))
+        shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
+        small = scene.changed(size=shape, subsamples=1)
+        # fragments are interpolated from nodes of their own part
+        apart = _APART * small.pixel_part[:, None].astype(np.float32)
+        places = np.concatenate([places_of(small), apart], axis=1)
+        kept, error = np.zeros(0, np.int64), np.zeros(0)
+        if last is not None and known is not None and last.shape is scene.shape:
+            kept, error = _carried(last, known, small)
+        at = self._chosen(places, kept, error)
+        near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS)
+        tensors = torch.from_numpy(near.astype(np.int32)), torch.from_numpy(weights)
+        self._of, self._scene, self._places = scene, small, places
+        self._nodes = _Nodes(at, *tensors, np.zeros(len(at)))
+        return small, places, self._nodes
+
+    def _chosen(self, places: Float32, kept: Int64, error: Float64) -> Int64:
+        """Return nodes (n,): most of those that are kept, and fresh ones where they are needed."""
+        count = len(places)
+        wanted = min(NODES, count)
+        most = int((1.0 - _NEW) * wanted)
+        if len(kept) > most:  # those go that the frame would miss least
+            nearest = cKDTree(places[kept]).query(places[kept], 2)[0][:, 1]
+            stay = np.argsort(-(error + _EVEN * error.mean()) * nearest, kind="stable")[:most]
+            kept, error = kept[stay], error[stay]
+        some = self._rng.choice(count, min(_CANDIDATES, count), replace=False)
+        some = np.setdiff1d(some, kept)
+        score = np.ones(len(some))
+        if len(kept):
+            away, near = cKDTree(places[kept]).query(places[some], 1)
+            score = (error[near] + _EVEN * error.mean() + 1e-9) * away + 1e-12
+        fresh = min(wanted - len(kept), len(some))
+        chosen = self._rng.choice(some, fresh, replace=False, p=score / max(score.sum(), 1e-300))
+        return np.concatenate([kept, chosen])
+
+
+def _same_view(one: Scene, other: Scene) -> bool:
+    """Return whether two scenes show the same fragments."""
+    return (
+        one.shape is other.shape
+        and one.camera == other.camera
+        and (one.height, one.width, one.parts) == (other.height, other.width, other.parts)
+    )
+
+
+def _carried(last: Scene, nodes: _Nodes, small: Scene) -> tuple[Int64, Float64]:
+    """Return the fragments of a scene where nodes of the last one are still seen, and errors."""
+    points = last.positions[last.offsets[nodes.at]]
+    height, width = small.height, small.width
+    x, y = np.nan_to_num(small.camera.project(small.shape, height, width, points), nan=-1.0).T
+    inside = (x >= 0.0) & (y >= 0.0) & (x < width) & (y < height)
+    pixel = np.where(inside, np.floor(np.clip(y, 0, height - 1)) * width + np.floor(x), 0)
+    fragment = np.full(height * width, -1, np.int64)
+    fragment[small.pixels] = np.arange(len(small.pixels))
+    at = fragment[pixel.astype(np.int64).clip(0, height * width - 1)]
+    found = np.flatnonzero(inside & (at >= 0))
+    there = small.positions[small.offsets[at[found]]]
+    # within two pixels of the same point of the same part, not in front of it or behind
+    same = small.pixel_part[at[found]] == last.pixel_part[nodes.at[found]]
+    near = 4.0 * small.shape.radius / min(height, width) * 2.0
+    same &= np.linalg.norm(there - points[found], axis=1) < near
+    at, first = np.unique(at[found[same]], return_index=True)
+    return at, nodes.error[found[same]][first]
