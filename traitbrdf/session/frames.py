@@ -75,7 +75,6 @@ class View:
     draft: tuple[int, Draft] | None = None
     drafted: Drafted | None = None
     nodes: NodeTransport | None = None
-    decoded: dict[Material, Float32] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
 
     def keep(self, index: int, material: Material, shown: Shown) -> None:

@@ -50,6 +50,7 @@ from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.angles import AnglesSeen, angles_seen
 from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.glances import Glances
 from traitbrdf.transport.nodes import NodeTransport
 from traitbrdf.transport.transport import Transport
 from traitbrdf.transport.visibility import Progress
@@ -100,6 +101,8 @@ class Viewer:
         self._trees = LightTrees()
         self._lock = threading.RLock()
         self._view = View(scene)
+        self._glances: Glances | None = None
+        self._decoded: dict[Material, Float32] = {}  # tables of the last draft
         self._edited: set[str] = set()  # parts that a preparation has to serve all edits of
         if transport is not None:
             if transport.scene is not scene:
@@ -411,13 +414,59 @@ class Viewer:
             if view is self._view:  # else it is a picture of what was looked at before
                 return enlarged(known.image, scene.height, scene.width), known.error
 
+    def glance(self, size: int = 256) -> tuple[Float32, float]:
+        """Show the view at once, small and enlarged: frames while camera or light is moved.
+
+        After each `look`, a frame with the present materials takes a tenth of a second or less.
+        Frames that follow one another do not flicker.
+
+        Parameters
+        ----------
+        size : int
+            Pixels along the longer side at which it is rendered.
+
+        Returns
+        -------
+        image : (H, W, 3) float32 linear radiance, backdrop included
+        error : float
+            Mean relative L1 over the covered pixels without mirrors, measured at some of them.
+
+        Raises
+        ------
+        ValueError
+            If `size` is no positive integer.
+        """
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
+        while True:
+            with self._lock:
+                view = self._view
+                materials = tuple(self.materials[part] for part in view.scene.parts)
+            start = time.perf_counter()
+            with TURNS.urgent():
+                if self._glances is None or self._glances.size != size:
+                    self._glances = Glances(self.embedding.grid_, size, self.settings.seed)
+                known = self._decoded
+                tables = {
+                    m: known[m] if m in known else m.values(self.embedding) for m in materials
+                }
+                self._decoded = tables
+                frame = self._glances.frame(
+                    view.scene, [tables[m] for m in materials], [m.mirror for m in materials],
+                    self._trees.of(view.scene.environment),
+                )  # fmt: skip
+            view.times["glance"] = time.perf_counter() - start
+            if view is self._view:  # else it is a picture of what was looked at before
+                image = enlarged(frame.image, view.scene.height, view.scene.width)
+                return image, frame.error
+
     def _at_nodes(
         self, view: View, nodes: NodeTransport, materials: tuple[Material, ...]
     ) -> Drafted:
         start = time.perf_counter()
-        known = view.decoded
+        known = self._decoded
         tables = {m: known[m] if m in known else m.values(self.embedding) for m in materials}
-        view.decoded = tables
+        self._decoded = tables
         frame = nodes.frame([tables[m] for m in materials], [m.mirror for m in materials])
         view.times["draft"] = time.perf_counter() - start
         return Drafted(-len(nodes.nodes), materials, *frame)

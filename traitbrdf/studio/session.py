@@ -20,7 +20,7 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
     - ``assign`` {part, material}
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
-      ``dragging`` says that more of these follow at once: drafts are smaller, and preparation waits
+      ``dragging`` says that more of these follow at once: they get glances, and preparation waits
       for the end of the drag
     - ``do``: "undo", "redo"
     - ``save``, ``open``: names of design files in the session's folder
@@ -85,8 +85,6 @@ _POINTS = 4096
 """Greatest number of points of one stroke; later ones are left out."""
 _NEWS = 0.1
 """Seconds for which changes are collected before views are told."""
-_TURNING = 64
-"""Pixels along the longer side of drafts while the camera or the light is dragged."""
 _PADDED = 66_000
 _CHANGES = {"part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn", "do", "open"}
 """Keys of requests that may change what other views show."""
@@ -223,7 +221,7 @@ class Session:
         draft_error = None
         if not ready:
             # while the object is turned, speed matters more than detail
-            image, draft_error = edit.draft(_TURNING if dragging else None)
+            image, draft_error = edit.glance() if dragging else edit.draft()
         elif header.get("before") is True:
             image = edit.before()
         else:

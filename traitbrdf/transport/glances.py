@@ -21,7 +21,7 @@ from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.nodes import NodeFrame, kriging, places_of
 from traitbrdf.transport.operator import Operator
-from traitbrdf.transport.reflections import reflections, regression
+from traitbrdf.transport.reflections import blurred, reflections, regression
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -36,11 +36,14 @@ NEIGHBOURS = 5
 RESOLUTION = 0.15
 """Of the light, as for `Operator`."""
 
-PROBES = (24, 0.5)
+PROBES = (24, 0.35)
 """Fragments that measure the error, and the resolution of the light there."""
 
 _NEW = 0.15
 """Share of the nodes that leave and come at each frame."""
+
+_FIRST = 0.5
+"""Share of the nodes of a first, unseen frame that stay."""
 
 _CANDIDATES = 4000
 """Fragments of which the new nodes are chosen."""
@@ -88,6 +91,7 @@ class Glances:
         self._scene: Scene | None = None
         self._places: Float32 | None = None
         self._nodes: _Nodes | None = None
+        self._levels: tuple[Float32, list[torch.Tensor]] | None = None
 
     def frame(
         self,
@@ -109,6 +113,19 @@ class Glances:
         tree : LightTree or None
             The tree of the scene's map, if it was built before.
         """
+        if self._nodes is None or self._scene is None or self._scene.shape is not scene.shape:
+            self._nodes = None
+            self._frame(scene, tables, None, tree)  # it tells where nodes are needed
+            self._of = None
+        return self._frame(scene, tables, mirrors, tree)
+
+    def _frame(
+        self,
+        scene: Scene,
+        tables: Sequence[Float32],
+        mirrors: Sequence[Float64] | None,
+        tree: LightTree | None,
+    ) -> NodeFrame:
         small, places, nodes = self._seen(scene)
         operator = Operator(small, self.grid, RESOLUTION, tree)
         count = len(small.pixels)
@@ -123,7 +140,10 @@ class Glances:
                 if len(mine):
                     images = by.images(at[mine], one, by.core)
                     out[mine] = np.einsum("pcc->pc", images) / small.weights[at[mine], None]
-        columns = reflections(small)
+        image = scene.environment.image
+        if self._levels is None or self._levels[0] is not image:
+            self._levels = image, blurred(scene.environment)
+        columns = reflections(small, self._levels[1])
         known, weights = kriging(places, nodes.at, nodes.at, NEIGHBOURS, leave_out=True)
         drift = np.zeros((count, 3), np.float32)
         for part in range(len(tables)):
@@ -136,9 +156,11 @@ class Glances:
             slope = np.einsum("cdn,nc->cd", fitted, shown[mine])
             drift[span] = np.einsum("pcd,cd->pc", columns[span], slope)
         shown -= drift[nodes.at]
-        radiance = torch.nn.functional.embedding_bag(
-            nodes.near, torch.from_numpy(shown), per_sample_weights=nodes.weights, mode="sum"
-        ).numpy()  # fmt: skip
+        radiance = np.zeros((count, 3), np.float32)
+        if len(nodes.at):
+            radiance = torch.nn.functional.embedding_bag(
+                nodes.near, torch.from_numpy(shown), per_sample_weights=nodes.weights, mode="sum"
+            ).numpy()  # fmt: skip
         radiance = np.maximum(radiance + drift, 0.0)
         deviation, level = float(np.abs(radiance[probes] - exact).sum()), float(exact.sum())
         left_out = np.einsum("nk,nkc->nc", weights, shown[known]) if known.shape[1] else 0.0
@@ -146,13 +168,17 @@ class Glances:
         if mirrors is not None and any(np.any(m) for m in mirrors):
             weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[small.pixel_part]
             radiance = radiance + weight * operator.mirror(np.arange(count))
-        image = small.backdrop().reshape(-1, 3) * small.uncovered[:, None]
+        picture = np.zeros((small.height * small.width, 3), np.float32)
+        open_ = np.flatnonzero(small.uncovered)
+        _, rays = small.camera.rays(small.shape, small.height, small.width)
+        behind = small.environment.backdrop(rays.reshape(-1, 3)[open_])
+        picture[open_] = behind * small.uncovered[open_, None]
         covered = radiance * small.weights[:, None].astype(np.float32)
         if np.any(np.diff(np.sort(small.pixels)) == 0):
-            np.add.at(image, small.pixels, covered)
+            np.add.at(picture, small.pixels, covered)
         else:
-            image[small.pixels] += covered
-        frame = image.reshape(small.height, small.width, 3).astype(np.float32)
+            picture[small.pixels] += covered
+        frame = picture.reshape(small.height, small.width, 3)
         return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
 
     def _seen(self, scene: Scene) -> tuple[Scene, Float32, _Nodes]:
@@ -170,20 +196,21 @@ class Glances:
         apart = _APART * small.pixel_part[:, None].astype(np.float32)
         places = np.concatenate([places_of(small), apart], axis=1)
         kept, error = np.zeros(0, np.int64), np.zeros(0)
-        if last is not None and known is not None and last.shape is scene.shape:
+        first = self._of is None
+        if last is not None and known is not None:
             kept, error = _carried(last, known, small)
-        at = self._chosen(places, kept, error)
-        near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS)
+        at = self._chosen(places, kept, error, _FIRST if first else 1.0 - _NEW)
+        near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS, loose=0.3)
         tensors = torch.from_numpy(near.astype(np.int32)), torch.from_numpy(weights)
         self._of, self._scene, self._places = scene, small, places
         self._nodes = _Nodes(at, *tensors, np.zeros(len(at)))
         return small, places, self._nodes
 
-    def _chosen(self, places: Float32, kept: Int64, error: Float64) -> Int64:
-        """Return nodes (n,): most of those that are kept, and fresh ones where they are needed."""
+    def _chosen(self, places: Float32, kept: Int64, error: Float64, share: float) -> Int64:
+        """Return nodes (n,): at most a share of known ones, and fresh ones where needed."""
         count = len(places)
         wanted = min(NODES, count)
-        most = int((1.0 - _NEW) * wanted)
+        most = int(share * wanted)
         if len(kept) > most:  # those go that the frame would miss least
             nearest = cKDTree(places[kept]).query(places[kept], 2)[0][:, 1]
             stay = np.argsort(-(error + _EVEN * error.mean()) * nearest, kind="stable")[:most]
@@ -195,7 +222,9 @@ class Glances:
             away, near = cKDTree(places[kept]).query(places[some], 1)
             score = (error[near] + _EVEN * error.mean() + 1e-9) * away + 1e-12
         fresh = min(wanted - len(kept), len(some))
-        chosen = self._rng.choice(some, fresh, replace=False, p=score / max(score.sum(), 1e-300))
+        if fresh <= 0:
+            return kept
+        chosen = self._rng.choice(some, fresh, replace=False, p=score / score.sum())
         return np.concatenate([kept, chosen])
 
 

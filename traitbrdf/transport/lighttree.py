@@ -10,6 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,11 @@ class LightTree:
     child: NDArray[np.int32]
     rectangle: NDArray[np.int32]
     block: int = 1
+
+    @cached_property
+    def derived(self) -> dict[tuple[object, ...], Any]:
+        """What others made of the tree, by names of their own; it is kept as long as the tree."""
+        return {}
 
     @cached_property
     def packed(self) -> tuple[Float32, Float32, Int32, Int32]:

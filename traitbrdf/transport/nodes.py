@@ -374,7 +374,12 @@ class NodeTransport:
 
 
 def kriging(
-    places: Float32, nodes: Int64, at: Int64, neighbours: int, leave_out: bool = False
+    places: Float32,
+    nodes: Int64,
+    at: Int64,
+    neighbours: int,
+    leave_out: bool = False,
+    loose: float = 0.0,
 ) -> tuple[Int64, Float32]:
     """Find the nodes that fragments are interpolated from, and their weights, both (m, k).
 
@@ -390,11 +395,14 @@ def kriging(
         k, or the number of nodes if that is smaller.
     leave_out : bool
         Whether `at` are the nodes, each of which is to be interpolated from the others.
+    loose : float
+        By what share a node that is taken may be further away than one that is not.
     """
     count = min(neighbours, len(nodes) - leave_out)
-    if not count:
+    if count <= 0:
         return np.zeros((len(at), 0), np.int64), np.zeros((len(at), 0), np.float32)
-    _, near = cKDTree(places[nodes]).query(places[at], count + leave_out, workers=-1)
+    tree = cKDTree(places[nodes])
+    _, near = tree.query(places[at], count + leave_out, eps=loose, workers=-1)
     near = near.reshape(len(at), -1)[:, int(leave_out) :].astype(np.int64)
     weights = np.empty(near.shape, np.float32)
     kriging_weights(weights, places[nodes], places[at], np.ascontiguousarray(near))

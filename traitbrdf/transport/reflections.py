@@ -9,6 +9,7 @@ interpolated. Both are linear in the table.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse
@@ -29,7 +30,7 @@ _RIDGE = 0.1
 """Weight of small coefficients in the regression, relative to the mean square of a column."""
 
 
-def reflections(scene: Scene) -> Float32:
+def reflections(scene: Scene, levels: Sequence[torch.Tensor] | None = None) -> Float32:
     """Return the brightness (P, 3, D) of the map in each fragment's mirror direction.
 
     It is 0 where the direction is hidden. One half of the columns are maps blurred to different
@@ -38,6 +39,8 @@ def reflections(scene: Scene) -> Float32:
     Parameters
     ----------
     scene : Scene
+    levels : sequence of tensors or None
+        What `blurred` made of the scene's map, if it did before.
     """
     middle = scene.offsets[:-1] + np.diff(scene.offsets) // 2
     normals, views = scene.normals[middle], scene.views[middle]
@@ -49,7 +52,7 @@ def reflections(scene: Scene) -> Float32:
     cosine = np.einsum("pk,pk->p", normals, views).clip(0.0, 1.0)
     fresnel = torch.from_numpy(((1.0 - cosine) ** 5).astype(np.float32))
     columns = []
-    for level in _levels(scene.environment):
+    for level in blurred(scene.environment) if levels is None else levels:
         wide = level.shape[-1]
         # the map's ends meet: a margin of one texel on either side
         around = torch.cat([level[..., -1:], level, level[..., :1]], dim=-1)
@@ -63,8 +66,13 @@ def reflections(scene: Scene) -> Float32:
     return torch.cat([plain, plain * fresnel[:, None, None]], dim=2).numpy()
 
 
-def _levels(environment: EnvironmentMap) -> list[torch.Tensor]:
-    """Return the map (3, rows, 2 rows) at several sizes, by the means over solid angle."""
+def blurred(environment: EnvironmentMap) -> list[torch.Tensor]:
+    """Return a map (3, rows, columns) at several sizes, by means over solid angle.
+
+    Parameters
+    ----------
+    environment : EnvironmentMap
+    """
     image = torch.from_numpy(environment.image.copy()).permute(2, 0, 1)
     rows = image.shape[1]
     area = torch.sin((torch.arange(rows) + 0.5) * (math.pi / rows))[None, :, None]

@@ -78,6 +78,9 @@ class VisibilityCut:
         share : float
             Greatest share of all flux in a node. Leaves of the tree may exceed both.
         """
+        known: VisibilityCut | None = tree.derived.get(("cut", spacing, share))
+        if known is not None:
+            return known
         flux = tree.flux
         whole = (tree.child < 0).all(axis=1)
         total = max(float(flux[whole].sum()), 1e-300)
@@ -89,7 +92,9 @@ class VisibilityCut:
         _, nearest = cKDTree(directions).query(directions, k=near)
         neighbours = np.repeat(np.arange(len(cut), dtype=np.int32)[:, None], 6, axis=1)
         neighbours[:, : near - 1] = np.asarray(nearest).reshape(len(cut), near)[:, 1:]
-        return cls(first, last, directions, flux[cut] / total, neighbours)
+        made = cls(first, last, directions, flux[cut] / total, neighbours)
+        tree.derived["cut", spacing, share] = made
+        return made
 
 
 class Bundles(NamedTuple):
