@@ -41,7 +41,7 @@ HOMES = {
     "trimesh": {"scene/shapes.py", "scene/meshes.py"},
     "numba": {
         "reflectance/descriptors.py", "space/highlights.py", "space/scores.py",
-        "transport/kernels.py",
+        "transport/interpolation.py", "transport/kernels.py",
     },
 }  # fmt: skip
 """Files that may import an outside package."""

@@ -18,10 +18,11 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.interpolation import interpolate_nodes, kriging
 from traitbrdf.transport.lighttree import LightTree
-from traitbrdf.transport.nodes import NodeFrame, kriging, places_of
+from traitbrdf.transport.nodes import NodeFrame, places_of
 from traitbrdf.transport.operator import Operator
-from traitbrdf.transport.reflections import blurred, reflections, regression
+from traitbrdf.transport.reflections import Regression, blurred, reflections, slopes_of
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -61,14 +62,14 @@ class _Nodes(NamedTuple):
     Attributes
     ----------
     at : (n,) int64, fragments of the small scene
-    near : (P, k) int32 tensor, the nodes that each fragment is interpolated from
-    weights : (P, k) float32 tensor
+    near : (P, k) int32, the nodes that each fragment is interpolated from
+    weights : (P, k) float32
     error : (n,) float64, of each node if it is interpolated from the others
     """
 
     at: Int64
-    near: torch.Tensor
-    weights: torch.Tensor
+    near: NDArray[np.int32]
+    weights: Float32
     error: Float64
 
 
@@ -146,22 +147,20 @@ class Glances:
         columns = reflections(small, self._levels[1])
         known, weights = kriging(places, nodes.at, nodes.at, NEIGHBOURS, leave_out=True)
         drift = np.zeros((count, 3), np.float32)
-        for part in range(len(tables)):
-            span = small.part_slice(part)
-            mine = np.flatnonzero(small.pixel_part[nodes.at] == part)
-            if not len(mine):
-                continue
-            order = np.searchsorted(mine, known[mine])
-            fitted = regression(columns[nodes.at[mine]], order, weights[mine])
-            slope = np.einsum("cdn,nc->cd", fitted, shown[mine])
-            drift[span] = np.einsum("pcd,cd->pc", columns[span], slope)
+        for one in {id(table): table for table in tables}.values():
+            parts = np.array([table is one for table in tables])
+            mine = np.flatnonzero(parts[small.pixel_part[nodes.at]])
+            if len(mine):
+                order = np.searchsorted(mine, known[mine])  # neighbours are of the same part
+                found = Regression.of(columns[nodes.at[mine]], order, weights[mine])
+                seen = torch.from_numpy(shown[mine].T.copy())[:, :, None]
+                slope = slopes_of(found.gram, torch.bmm(found.moments, seen))[..., 0].numpy()
+                every = parts[small.pixel_part]
+                drift[every] = np.einsum("pcd,cd->pc", columns[every], slope)
         shown -= drift[nodes.at]
-        radiance = np.zeros((count, 3), np.float32)
-        if len(nodes.at):
-            radiance = torch.nn.functional.embedding_bag(
-                nodes.near, torch.from_numpy(shown), per_sample_weights=nodes.weights, mode="sum"
-            ).numpy()  # fmt: skip
-        radiance = np.maximum(radiance + drift, 0.0)
+        radiance = drift
+        interpolate_nodes(radiance, shown, nodes.near, nodes.weights)
+        np.maximum(radiance, 0.0, out=radiance)
         deviation, level = float(np.abs(radiance[probes] - exact).sum()), float(exact.sum())
         left_out = np.einsum("nk,nkc->nc", weights, shown[known]) if known.shape[1] else 0.0
         self._nodes = nodes._replace(error=np.abs(left_out - shown).mean(axis=1))
@@ -201,9 +200,8 @@ class Glances:
             kept, error = _carried(last, known, small)
         at = self._chosen(places, kept, error, _FIRST if first else 1.0 - _NEW)
         near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS, loose=0.3)
-        tensors = torch.from_numpy(near.astype(np.int32)), torch.from_numpy(weights)
         self._of, self._scene, self._places = scene, small, places
-        self._nodes = _Nodes(at, *tensors, np.zeros(len(at)))
+        self._nodes = _Nodes(at, near.astype(np.int32), weights, np.zeros(len(at)))
         return small, places, self._nodes
 
     def _chosen(self, places: Float32, kept: Int64, error: Float64, share: float) -> Int64:

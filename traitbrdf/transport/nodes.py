@@ -25,10 +25,10 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.directions import reflect
 from traitbrdf.scene.scene import Scene
-from traitbrdf.transport.kernels import kriging_weights
+from traitbrdf.transport.interpolation import interpolate_nodes, kriging
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import Operator
-from traitbrdf.transport.reflections import reflections, regression
+from traitbrdf.transport.reflections import Regression, reflections, slopes_of
 from traitbrdf.transport.universal import UniversalBasis
 from traitbrdf.transport.visibility import Progress
 
@@ -81,10 +81,10 @@ class Nodes(NamedTuple):
         Radiance of nodes under the tables of the basis, as if they covered their pixel.
     near : (P, k) int32
         Nodes of the part that each of its fragments is interpolated from.
-    shares : (P, k) float32
-        Their weights, times the share of its pixel that the fragment covers.
-    slopes : (3, D, n) float32
-        Takes the radiance of the nodes to the coefficients of the reflections around them.
+    weights : (P, k) float32
+        Their weights.
+    regression : Regression
+        Of the radiance of the nodes on the reflections around them.
     left_out : pair of (n, k) int64 and (n, k) float32
         The nodes that each node is interpolated from if it is left out, and their weights.
     """
@@ -92,8 +92,8 @@ class Nodes(NamedTuple):
     at: Int64
     images: Float32
     near: NDArray[np.int32]
-    shares: Float32
-    slopes: Float32
+    weights: Float32
+    regression: Regression
     left_out: tuple[Int64, Float32]
 
 
@@ -103,16 +103,10 @@ class _Read(NamedTuple):
     Attributes
     ----------
     images : (3, n, R) float32
-    near : (P, k) int32
-    shares : (P, k) float32
-    slopes : (3, D, n) float32
     columns : (3, P, D) float32
     """
 
     images: torch.Tensor
-    near: torch.Tensor
-    shares: torch.Tensor
-    slopes: torch.Tensor
     columns: torch.Tensor
 
 
@@ -168,7 +162,6 @@ class NodeTransport:
         )
         rows = Operator(scene, basis.grid, 1.0, self.operator.tree).rows(self._probes)
         self._rows = torch.from_numpy(np.ascontiguousarray(rows.transpose(1, 0, 2)))
-        self._projection = torch.from_numpy(np.ascontiguousarray(basis.projection))
         self._pixels = torch.from_numpy(scene.pixels)
         backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
         self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop, dtype=np.float32))
@@ -176,8 +169,9 @@ class NodeTransport:
         self._columns = reflections(scene)
         none = np.zeros(0, np.int64), np.zeros((0, 3, basis.tables.shape[1]), np.float32)
         nothing = np.zeros((0, NEIGHBOURS), np.int32), np.zeros((0, NEIGHBOURS), np.float32)
-        slopes, alone = np.zeros((3, self._columns.shape[2], 0), np.float32), (none[0], none[1])
-        self.parts = [Nodes(*none, *nothing, slopes, alone) for _ in spans]
+        alone = np.zeros((0, 0), np.int64), np.zeros((0, 0), np.float32)
+        equations = Regression.of(self._columns[:0], *alone)
+        self.parts = [Nodes(*none, *nothing, equations, alone) for _ in spans]
         for most in (count // 2, count):
             self._add(most, tables, report)
         self._join(report)
@@ -233,24 +227,22 @@ class NodeTransport:
         scene = self.scene
         radiance = torch.empty((len(scene.pixels), 3))
         deviation = level = 0.0
-        known: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+        shown = self._at_nodes(tables)
         for part, table in enumerate(tables):
             span = scene.part_slice(part)
             if span.start == span.stop:
                 continue
-            if id(table) not in known:
-                cells = torch.from_numpy(table).T.contiguous()
-                known[id(table)] = cells, torch.stack([self._projection @ c for c in cells])
-            cells, coefficients = known[id(table)]
-            images, near, shares, slopes, columns = self._read[part]
-            shown = torch.bmm(images, coefficients[:, :, None])
-            slope = torch.bmm(slopes, shown)  # (3, D, 1)
-            shown -= torch.bmm(columns[:, self._at[part]], slope)
-            smooth = torch.nn.functional.embedding_bag(
-                near, shown[..., 0].T.contiguous(), per_sample_weights=shares, mode="sum"
-            )
-            smooth += self._covered[span] * torch.bmm(columns, slope)[..., 0].T
-            radiance[span] = smooth.clamp_min_(0.0)
+            on_ground = part >= len(scene.shape.parts)
+            values, slope = shown[id(table), int(on_ground)]
+            _, columns = self._read[part]
+            near, weights = self.parts[part].near, self.parts[part].weights
+            own = values[part - (len(scene.shape.parts) if on_ground else 0)]
+            rest = own - torch.bmm(columns[:, self._at[part]], slope)
+            smooth = torch.bmm(columns, slope)[..., 0].T.contiguous()
+            interpolate_nodes(smooth.numpy(), rest[..., 0].T.contiguous().numpy(), near, weights)
+            # a fragment shows the share of its pixel that it covers
+            radiance[span] = smooth.clamp_min_(0.0).mul_(self._covered[span])
+            cells = torch.from_numpy(table).T.contiguous()
             probes = slice(*np.searchsorted(self._probes, (span.start, span.stop)).tolist())
             exact = torch.stack([self._rows[c, probes] @ cells[c] for c in range(3)], dim=1)
             stands_for = (span.stop - span.start) / len(exact)
@@ -266,15 +258,43 @@ class NodeTransport:
         frame = image.reshape(scene.height, scene.width, 3).numpy()
         return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
 
+    def _at_nodes(
+        self, tables: Sequence[Float32]
+    ) -> dict[tuple[int, int], tuple[list[torch.Tensor], torch.Tensor]]:
+        """Return what nodes show, for each table (by its id) and group of parts that has it.
+
+        That is the radiance (3, n, 1) of the nodes of each part of the group, and coefficients
+        (3, D, 1) of reflections. These are found on all nodes of the group, whatever its parts are
+        made of: small parts have few, and an edit of one part must not change another.
+        """
+        found = {}
+        width = self._columns.shape[2]
+        for table in {id(table): table for table in tables}.values():
+            coefficients = torch.from_numpy(self.basis.projection @ table).T[:, :, None]
+            for g, group in enumerate(self._groups):
+                if not any(tables[part] is table for part in group):
+                    continue
+                gram, moments = torch.zeros((3, width, width)), torch.zeros((3, width, 1))
+                values = [torch.bmm(self._read[part].images, coefficients) for part in group]
+                for part, shown in zip(group, values, strict=True):
+                    gram += self.parts[part].regression.gram
+                    moments += torch.bmm(self.parts[part].regression.moments, shown)
+                found[id(table), g] = values, slopes_of(gram, moments)
+        return found
+
+    @property
+    def _groups(self) -> tuple[range, range]:
+        """Parts of the shape, and the ground."""
+        count = len(self.scene.shape.parts)
+        return range(count), range(count, len(self.parts))
+
     # -- nodes ----------------------------------------------------------------------------------
 
     def _add(self, count: int, tables: Sequence[Float32], report: Progress) -> None:
         """Draw nodes, until there are `count` in the scene, and compute their images."""
-        shape = range(len(self.scene.shape.parts))
-        ground = range(len(shape), len(self.parts))
         fresh = [np.zeros(0, np.int64) for _ in self.parts]
         # errors on the ground do not compare with those on the shape: each has its share of nodes
-        for group in (shape, ground):
+        for group in self._groups:
             spans = [self.scene.part_slice(part) for part in group]
             size = sum(span.stop - span.start for span in spans)
             if not size:
@@ -316,8 +336,8 @@ class NodeTransport:
             nodes = at if anew else np.concatenate([known.at, at])
             if len(nodes) > len(known.at):
                 left_out = kriging(self._places, nodes, nodes, NEIGHBOURS, leave_out=True)
-                slopes = regression(self._columns[nodes], *left_out)
-                known = known._replace(slopes=slopes, left_out=left_out)
+                equations = Regression.of(self._columns[nodes], *left_out)
+                known = known._replace(regression=equations, left_out=left_out)
             self.parts[part] = known._replace(at=nodes, images=np.concatenate(images))
 
     def _score(self, part: int, table: Float32) -> NDArray[np.float64]:
@@ -344,14 +364,11 @@ class NodeTransport:
         for part, nodes in enumerate(self.parts):
             span = self.scene.part_slice(part)
             every = np.arange(span.start, span.stop)
-            at, shares = kriging(self._places, nodes.at, every, NEIGHBOURS)
-            # a fragment shows the share of its pixel that it covers
-            shares *= covered[span, None]
-            self.parts[part] = nodes._replace(near=at.astype(np.int32), shares=shares)
+            at, weights = kriging(self._places, nodes.at, every, NEIGHBOURS)
+            self.parts[part] = nodes._replace(near=at.astype(np.int32), weights=weights)
             images = np.ascontiguousarray(nodes.images.transpose(1, 0, 2))
             columns = np.ascontiguousarray(self._columns[span].transpose(1, 0, 2))
-            read = images, self.parts[part].near, shares, nodes.slopes, columns
-            self._read.append(_Read(*(torch.from_numpy(a) for a in read)))
+            self._read.append(_Read(torch.from_numpy(images), torch.from_numpy(columns)))
         self._at = [
             torch.from_numpy(nodes.at - self.scene.part_slice(part).start)
             for part, nodes in enumerate(self.parts)
@@ -366,47 +383,13 @@ class NodeTransport:
         error = np.full(len(nodes.at), 1e-12)
         for coefficients in shown:
             radiance = np.einsum("ncr,rc->nc", nodes.images, coefficients)
-            slope = np.einsum("cdn,nc->cd", nodes.slopes, radiance)
+            seen = torch.from_numpy(np.ascontiguousarray(radiance.T))[:, :, None]
+            gram, moments = nodes.regression
+            slope = slopes_of(gram, torch.bmm(moments, seen))[..., 0].numpy()
             rest = radiance - np.einsum("ncd,cd->nc", columns, slope)
             found = np.einsum("nk,nkc->nc", weights, rest[near])
             error += np.abs(found - rest).mean(axis=1) / max(float(radiance.mean()), 1e-30)
         return error
-
-
-def kriging(
-    places: Float32,
-    nodes: Int64,
-    at: Int64,
-    neighbours: int,
-    leave_out: bool = False,
-    loose: float = 0.0,
-) -> tuple[Int64, Float32]:
-    """Find the nodes that fragments are interpolated from, and their weights, both (m, k).
-
-    Parameters
-    ----------
-    places : (fragments, d) float32
-        Where fragments lie.
-    nodes : (n,) int64
-        Fragments that are known.
-    at : (m,) int64
-        Fragments to interpolate at.
-    neighbours : int
-        k, or the number of nodes if that is smaller.
-    leave_out : bool
-        Whether `at` are the nodes, each of which is to be interpolated from the others.
-    loose : float
-        By what share a node that is taken may be further away than one that is not.
-    """
-    count = min(neighbours, len(nodes) - leave_out)
-    if count <= 0:
-        return np.zeros((len(at), 0), np.int64), np.zeros((len(at), 0), np.float32)
-    tree = cKDTree(places[nodes])
-    _, near = tree.query(places[at], count + leave_out, eps=loose, workers=-1)
-    near = near.reshape(len(at), -1)[:, int(leave_out) :].astype(np.int64)
-    weights = np.empty(near.shape, np.float32)
-    kriging_weights(weights, places[nodes], places[at], np.ascontiguousarray(near))
-    return near, weights
 
 
 def places_of(scene: Scene) -> Float32:

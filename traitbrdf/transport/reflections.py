@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -85,36 +86,60 @@ def blurred(environment: EnvironmentMap) -> list[torch.Tensor]:
     return levels
 
 
-def regression(columns: Float32, near: Int64, weights: Float32) -> Float32:
-    """Return the matrices (3, D, n) that take radiance at nodes to coefficients of columns.
+class Regression(NamedTuple):
+    """The normal equations by which radiance at nodes is regressed on reflections, by colour.
 
-    The coefficients are those that make interpolation err least: what the others say of a node is
-    taken from its radiance and from its columns before one is regressed on the other.
+    Those of several parts of one material add up.
+
+    Attributes
+    ----------
+    gram : (3, D, D) float32
+    moments : (3, D, n) float32
+        Takes the radiance of the nodes to the right-hand side.
+    """
+
+    gram: torch.Tensor
+    moments: torch.Tensor
+
+    @classmethod
+    def of(cls, columns: Float32, near: Int64, weights: Float32) -> Regression:
+        """Return the equations of coefficients with which interpolation errs least.
+
+        What the others say of a node is taken from its radiance and from its columns before one is
+        regressed on the other.
+
+        Parameters
+        ----------
+        columns : (n, 3, D) float32
+            Reflections at the nodes.
+        near : (n, k) int64
+            Nodes that each is interpolated from if it is left out.
+        weights : (n, k) float32
+        """
+        count, _, width = columns.shape
+        gram = np.zeros((3, width, width), np.float32)
+        moments = np.zeros((3, width, count), np.float32)
+        if near.size:
+            starts = np.arange(0, near.size + 1, near.shape[1])
+            values = weights.ravel().astype(np.float64)
+            others = scipy.sparse.csr_array((values, near.ravel(), starts), shape=(count, count))
+            rest = scipy.sparse.eye_array(count, format="csr") - others
+            for c in range(3):
+                design = rest @ columns[:, c].astype(np.float64)
+                gram[c], moments[c] = design.T @ design, (rest.T @ design).T
+        return cls(torch.from_numpy(gram), torch.from_numpy(moments))
+
+
+def slopes_of(gram: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    """Return the coefficients (3, D, 1) of reflections.
 
     Parameters
     ----------
-    columns : (n, 3, D) float32
-        Reflections at the nodes.
-    near : (n, k) int64
-        Nodes that each is interpolated from if it is left out.
-    weights : (n, k) float32
+    gram : (3, D, D) tensor
+    moments : (3, D, 1) tensor
+        Right-hand side: `Regression.moments` times the radiance of the nodes.
     """
-    count, _, width = columns.shape
-    if count <= width or not near.shape[1]:
-        return np.zeros((3, width, count), np.float32)
-    others = scipy.sparse.csr_array(
-        (
-            weights.ravel().astype(np.float64),
-            near.ravel(),
-            np.arange(0, near.size + 1, near.shape[1]),
-        ),
-        shape=(count, count),
-    )
-    rest = scipy.sparse.eye_array(count, format="csr") - others
-    found = np.empty((3, width, count), np.float32)
-    for c in range(3):
-        design = rest @ columns[:, c].astype(np.float64)
-        gram = design.T @ design
-        gram += _RIDGE * max(float(gram.diagonal().max()), 1e-30) * np.eye(width)
-        found[c] = np.linalg.solve(gram, (rest.T @ design).T)
+    ridge = _RIDGE * gram.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(1e-30)
+    identity = torch.eye(gram.shape[1])
+    found: torch.Tensor = torch.linalg.solve(gram + ridge[:, None, None] * identity, moments)
     return found
