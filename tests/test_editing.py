@@ -1296,6 +1296,11 @@ def written():
             thread.join(60.0)
 
 
+def views(cache):
+    """The files of prepared views; the universal basis, which serves all views, is none of them."""
+    return [file for file in cache.iterdir() if not file.name.startswith("universal-")]
+
+
 def cache_session(**arguments):
     scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=16), size=12)
     return EditSession(scene, "preview", **arguments)
@@ -1305,7 +1310,7 @@ def test_a_preparation_is_found_again(cache):
     first = cache_session()
     frame = first.render()
     written()
-    (file,) = cache.iterdir()
+    (file,) = views(cache)
     os.utime(file, (0, 0))
     told = []
     second = cache_session(progress=lambda *news: told.append(news))
@@ -1383,7 +1388,7 @@ def test_a_shape_that_only_knows_itself_is_not_cached(cache):
     assert cache_key(scene, LIBRARY, 24, 0.7, 0) is None
     EditSession(scene, "preview").prepare()
     written()
-    assert not cache.exists()
+    assert views(cache) == []
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "other", "shape", "type", "empty", "folder"])
@@ -1391,7 +1396,7 @@ def test_a_damaged_file_is_a_miss_and_goes(cache, damage):
     session = cache_session()
     frame = session.render()
     written()
-    (file,) = cache.iterdir()
+    (file,) = views(cache)
     data = bytearray(file.read_bytes())
     if damage == "cut":
         file.write_bytes(data[: len(data) // 2])
@@ -1770,3 +1775,59 @@ def test_a_frame_that_is_held_is_never_drawn_upon(small_sphere):
     assert np.abs(again[::2, ..., 0] - kept[0]).max() > 0.01
     for view, was in zip(views, kept, strict=True):
         np.testing.assert_array_equal(np.asarray(view), was)
+
+
+# -- exact frames behind ----------------------------------------------------------------------
+
+
+def test_doubtful_parts_become_exact(small_teapot, prepared):
+    """What `improve` finds is what a frame that somebody waits for would show."""
+    session, waits = (EditSession(small_teapot, error=1e-9, transport=prepared) for _ in range(2))
+    session.render(exact=False)
+    doubtful = len(session.doubtful)
+    assert doubtful
+    calls = 0
+    while session.improve():
+        calls += 1
+    assert calls == doubtful and not session.improve()
+    np.testing.assert_array_equal(session.render(exact=False), waits.render())
+    assert session.doubtful == [] and session.report()["exact_frames"] == doubtful
+
+
+def test_edits_go_on_while_a_part_becomes_exact(small_teapot, prepared, monkeypatch):
+    session = EditSession(small_teapot, error=1e-9, transport=prepared)
+    session.render(exact=False)
+    part = session.doubtful[0]
+    reached, opened = threading.Event(), threading.Event()
+    whole = type(prepared).shade_exactly
+
+    def held(self, index, table, mirror=None, progress=None):
+        reached.set()
+        assert opened.wait(60.0)
+        return whole(self, index, table, mirror, progress)
+
+    monkeypatch.setattr(type(prepared), "shade_exactly", held)
+    behind = threading.Thread(target=session.improve)
+    behind.start()
+    assert reached.wait(60.0)
+    before = session.render(exact=False)  # nobody waits
+    session.assign(part, "red-rubber")
+    after = session.render(exact=False)
+    assert not np.array_equal(before, after)
+    opened.set()
+    behind.join(60.0)
+    assert not behind.is_alive()
+    # what became exact was the old material: the new one is shown as before
+    np.testing.assert_array_equal(session.render(exact=False), after)
+    assert part in session.doubtful
+
+
+def test_a_basis_learns_behind(prepared):
+    """As in front: the same bases, and the first transport is as it was."""
+    one = prepared
+    known = [basis.basis for basis in one.bases]
+    part = next(i for i, p in enumerate(one.parts) if p is not None)
+    image = one.shade_exactly(part, EMBEDDING.decode_values(LIBRARY.coordinates[7])).radiance
+    other = one.trained(part, image)
+    assert all(a is b.basis for a, b in zip(known, one.bases, strict=True))
+    assert other.rank_used > one.rank_used

@@ -336,6 +336,18 @@ def test_exact_frames_are_made_when_asked_for(session):
     assert edit.report()["exact_frames"] > 0
 
 
+def test_parts_become_exact_behind_a_hand_that_rests(session):
+    edit = session.edit
+    edit.settings = dataclasses.replace(edit.settings, error=1e-9)  # nothing meets that
+    state = frame(ask(session))["state"]
+    assert state["doubtful"] and session.refiner is None  # while somebody edits, nobody computes
+    ask(session, rest=True)
+    session.refiner.join(60.0)
+    state = frame(ask(session))["state"]
+    assert state["doubtful"] == [] and state["trouble"] == ""
+    assert edit.report()["exact_frames"] > 0
+
+
 def test_saving_and_opening(session, tmp_path):
     ask(session, [samples(along(session))], brush=BRUSH)
     shown = Screen().draw(ask(session, rest=True))

@@ -116,8 +116,8 @@ def universal_key(library: Library, seed: int) -> str:
     library : Library
     seed : int
     """
-    return _hash(
-        "universal", _CACHE_FORMAT, _code(), library.embedding.fingerprint(), library.coordinates,
+    return "universal-" + _hash(
+        _CACHE_FORMAT, _code(), library.embedding.fingerprint(), library.coordinates,
         seed,
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,12 +19,37 @@ from traitbrdf.session.preparation import TURNS, trusted_error
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.material import Material
+from traitbrdf.transport.basis import Basis
 from traitbrdf.transport.transport import PartFrame, Transport
+from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
 
 TRAINED_IMAGES = 8
 """At most this many exact images are added to a basis."""
+
+
+class Exact(NamedTuple):
+    """A part rendered without the basis, and what later frames may use of it.
+
+    Attributes
+    ----------
+    frame : PartFrame
+    floor : float
+        Error that exact frames of the part have, where it is above what is trusted; else 0.
+    trained : Transport or None
+        The transport with its image added to the basis, if that may help.
+    budget : int
+        Images that may still be added to the basis then.
+    known : list
+        The bases that it was trained from.
+    """
+
+    frame: PartFrame
+    floor: float
+    trained: Transport | None
+    budget: int
+    known: list[Basis]
 
 
 @dataclass(frozen=True)
@@ -107,13 +132,13 @@ class Renderer:
         if part is not None and part.group in view.budget:
             tier = "trained"
         if exact and frame.error > self.allowed(view, index):
-            frame, tier = self._exactly(view, transport, index, material, mirror), "exact"
+            frame, tier = self._exactly(view, transport, index, material), "exact"
             tables.clear()  # the transport may see other cells by now
         shown = Shown(frame, tier, time.perf_counter() - start)
         view.keep(index, material, shown)
         return shown
 
-    def allowed(self, view: View, index: int) -> float:
+    def allowed(self, view: View, index: int, floor: float | None = None) -> float:
         """Return the measured error up to which a part is shown by the basis.
 
         Parameters
@@ -121,6 +146,8 @@ class Renderer:
         view : View
         index : int
             Index of the part.
+        floor : float or None
+            Error of the part's exact frames; None is what the view knows of it.
         """
         if self.settings.quality == "reference":
             return -1.0
@@ -128,34 +155,75 @@ class Renderer:
             return math.inf
         # exact frames gain nothing where they err as much
         allowed = trusted_error(view.scene, index, self.settings.error)
-        return max(allowed, view.floor.get(index, 0.0)) if self.settings.error is None else allowed
+        least = view.floor.get(index, 0.0) if floor is None else floor
+        return max(allowed, least) if self.settings.error is None else allowed
 
     def _exactly(
+        self, view: View, transport: Transport, index: int, material: Material
+    ) -> PartFrame:
+        """Render a part without the basis, and add its image to the basis for later edits."""
+        with TURNS.urgent():
+            found = self.exact(view, transport, index, material)
+        self.take(view, transport, index, found)
+        return found.frame
+
+    def exact(
         self,
         view: View,
         transport: Transport,
         index: int,
         material: Material,
-        mirror: torch.Tensor | None,
-    ) -> PartFrame:
-        """Render a part without the basis, and add its image to the basis for later edits."""
+        progress: Progress | None = None,
+    ) -> Exact:
+        """Render a part without the basis, and extend a copy of the basis; nothing is changed.
+
+        Parameters
+        ----------
+        view : View
+        transport : Transport, of the view
+        index : int
+            Index of the part.
+        material : Material
+        progress : called with (stage, fraction done); may raise to cancel
+        """
         values = material.values(self.embedding)
-        part = transport.parts[index]
-        with TURNS.urgent():
-            frame = transport.shade_exactly(index, values)
-            if frame.error > trusted_error(view.scene, index):
-                view.floor[index] = max(view.floor.get(index, 0.0), 1.2 * frame.error)
-            allowed = self.allowed(view, index)
-            budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)
-            # if even the exact frame misses the error asked for, the basis cannot meet it
-            if part is not None and budget > 0 and frame.error <= allowed:
-                transport.train(index, frame.radiance)
-                table = torch.from_numpy(values[transport.cells]).to(self.settings.place)
-                met = transport.shade(index, table).error <= allowed
-                view.trained[index] = view.trained.get(index, 0) + 1
-                # every image makes all frames slower: take few that do not help
-                view.budget[part.group] = budget - (1 if met else TRAINED_IMAGES // 2)
+        part, known = transport.parts[index], transport.bases
+        frame = transport.shade_exactly(index, values, progress=progress)
+        floor = view.floor.get(index, 0.0)
+        if frame.error > trusted_error(view.scene, index):
+            floor = max(floor, 1.2 * frame.error)
+        allowed = self.allowed(view, index, floor)
+        budget = 0 if part is None else view.budget.get(part.group, TRAINED_IMAGES)
+        trained = None
+        # if even the exact frame misses the error asked for, the basis cannot meet it
+        if part is not None and budget > 0 and frame.error <= allowed:
+            trained = transport.trained(index, frame.radiance)
+            table = torch.from_numpy(values[trained.cells]).to(self.settings.place)
+            met = trained.shade(index, table).error <= allowed
+            # every image makes all frames slower: take few that do not help
+            budget -= 1 if met else TRAINED_IMAGES // 2
+        if material.mirror.any() and part is not None:
+            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
+            frame = replace(frame, radiance=frame.radiance + mirror * part.mirror)
+        return Exact(frame, floor, trained, budget, known)
+
+    def take(self, view: View, transport: Transport, index: int, found: Exact) -> None:
+        """Let the view's later frames use what `exact` found; the caller holds the view's lock.
+
+        Parameters
+        ----------
+        view : View
+        transport : Transport, of the view
+        index : int
+            Index of the part.
+        found : Exact
+        """
         view.exact_frames += 1
-        if mirror is None or part is None:
-            return frame
-        return replace(frame, radiance=frame.radiance + mirror * part.mirror)
+        if found.floor > 0.0:
+            view.floor[index] = found.floor
+        part = transport.parts[index]
+        # another image may have been added meanwhile: then this one is not
+        if found.trained is not None and part is not None and transport.bases is found.known:
+            transport.adopt(found.trained)
+            view.trained[index] = view.trained.get(index, 0) + 1
+            view.budget[part.group] = found.budget

@@ -31,7 +31,7 @@ from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap, Light
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.cache import Cache
-from traitbrdf.session.frames import Drafted, View, enlarged, measured
+from traitbrdf.session.frames import Drafted, Shown, View, enlarged, measured
 from traitbrdf.session.preparation import (
     DRAFT_SIZE,
     NODES,
@@ -39,6 +39,7 @@ from traitbrdf.session.preparation import (
     LightTrees,
     Preparation,
     Prepared,
+    StoppedError,
     prepare_view,
     universal_basis,
 )
@@ -532,6 +533,49 @@ class Viewer:
                 if one.tier != "exact" and one.frame.error > self.renderer.allowed(view, i)
             ]
 
+    def improve(self) -> bool:
+        """Render one of the `doubtful` parts without the basis, while others edit and draw.
+
+        This takes seconds, in the calling thread. Later frames show what was found, and similar
+        materials by the basis, which learns from it.
+
+        Returns
+        -------
+        bool
+            Whether there was anything to improve; the next call may find more.
+        """
+        with self._lock:
+            view, transport = self._view, self._serving(self._view)
+            if transport is None:
+                return False
+            self._frame(view, transport, exact=False)  # what is doubtful among present materials
+            if not self.doubtful:
+                return False
+            name = self.doubtful[0]
+            index, material = view.scene.parts.index(name), self.materials[name]
+            renderer, owner = self.renderer, object()
+
+        def outdated() -> bool:
+            return self._view is not view or self.materials[name] != material
+
+        def told(stage: str, fraction: float) -> None:
+            TURNS.give(owner)  # drafts and frames that somebody waits for go first
+            TURNS.take(owner, False, outdated)
+
+        start = time.perf_counter()
+        try:
+            TURNS.take(owner, False, outdated)
+            found = renderer.exact(view, transport, index, material, told)
+        except StoppedError:
+            return True
+        finally:
+            TURNS.give(owner)
+        with self._lock:
+            if self._serving(view) is transport:
+                renderer.take(view, transport, index, found)
+                view.keep(index, material, Shown(found.frame, "exact", time.perf_counter() - start))
+        return True
+
     @property
     def frame_error(self) -> float | None:
         """Measured mean relative L1 of the last frame; None before the first."""
@@ -540,11 +584,16 @@ class Viewer:
             known = view.prepared
             return measured(view, known.transport) if known is not None and view.shown else None
 
-    def frames(self) -> Iterator[tuple[Float32, float, float]]:
+    def frames(self, exact: bool = True) -> Iterator[tuple[Float32, float, float]]:
         """Yield images that get better: drafts, then the finished frame.
 
         Closing the generator cancels the preparation, and cancelling the preparation ends the
         generator.
+
+        Parameters
+        ----------
+        exact : bool
+            Of the finished frame, as for `render`.
 
         Yields
         ------
@@ -576,7 +625,7 @@ class Viewer:
                 if job is not None:
                     job.done.wait(_TICK)
             with self._prepared() as (view, transport):
-                image, error = self._frame(view, transport), measured(view, transport)
+                image, error = self._frame(view, transport, exact), measured(view, transport)
             yield image, error, 1.0
         finally:
             if not self.ready:

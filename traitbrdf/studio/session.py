@@ -247,7 +247,8 @@ class Session:
             reply["traits"] = list(edit.traits.names)
             reply["library"] = list(edit.library.names)
         self._dragging = dragging
-        if not ready and not self._dragging:
+        # what is prepared, or made exact, is shown when it is there: nobody waits
+        if not self._dragging and (not ready or (rest and edit.doubtful)):
             self._refine()
         if _CHANGES.intersection(header):
             self._tell(view)
@@ -550,7 +551,7 @@ class Session:
                 continue
             edit = self.edit
             try:
-                for _, _, fraction in edit.frames():
+                for _, _, fraction in edit.frames(exact=False):
                     self._fraction = fraction
                     self._tell("")
                     if self.edit is not edit or self._closed or self._dragging:
@@ -561,6 +562,12 @@ class Session:
                 self._trouble = f"{error}"[:500]
                 self._tell("")
                 return
+            try:
+                while self.edit is edit and not (self._closed or self._dragging) and edit.improve():
+                    self._tell("")
+            except Exception as error:
+                self._trouble = f"{error}"[:500]
+                self._tell("")
             with self._lock:
                 if self.edit is edit and (edit.ready or self._closed):
                     self.refiner = None

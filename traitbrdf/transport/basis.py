@@ -27,6 +27,8 @@ from traitbrdf.reflectance.models import (
     Sheen,
     TorranceSparrowSimplified,
 )
+from traitbrdf.scene.lights import Light, PointLight
+from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.operator import Operator as Operator
 from traitbrdf.transport.visibility import Progress as Progress
 
@@ -252,3 +254,16 @@ def extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
     keep = squares > 1e-10  # grey light, or an image within the span, adds fewer columns
     fresh = (fresh @ vectors[:, keep]) * squares[keep].rsqrt()
     return torch.cat([basis, fresh.float()], dim=1)
+
+
+def is_grey(scene: Scene) -> bool:
+    """Return whether all light of a scene is grey."""
+    image = scene.environment.image
+    colours = [np.asarray(c) for light in scene.lights for c in [_colour(light)]]
+    same = bool((image[..., 1:] == image[..., :1]).all())
+    return same and all(bool((c == c[0]).all()) for c in colours)
+
+
+def _colour(light: Light) -> tuple[float, float, float]:
+    """Return what sets a light's colour: its intensity or its irradiance."""
+    return light.intensity if isinstance(light, PointLight) else light.irradiance

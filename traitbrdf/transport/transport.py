@@ -47,7 +47,6 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf.reflectance.brdf import HalfDiffGrid
-from traitbrdf.scene.lights import Light, PointLight
 from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.basis import (
     TOP,
@@ -55,6 +54,7 @@ from traitbrdf.transport.basis import (
     Training,
     damping_of,
     extended,
+    is_grey,
     leading,
     per_colour,
 )
@@ -581,6 +581,23 @@ class Transport:
                 basis.cells = torch.nonzero(seen)[:, 0]
         self._projected = ()
 
+    def trained(self, part: int, radiance: torch.Tensor) -> Transport:
+        """Return a transport that `train` has extended; this one may be in use meanwhile.
+
+        Parameters
+        ----------
+        part, radiance
+            As for `train`.
+        """
+        other = copy.copy(self)
+        other.parts, other.bases = list(self.parts), [replace(basis) for basis in self.bases]
+        other.train(part, radiance)
+        return other
+
+    def adopt(self, other: Transport) -> None:
+        """Take over the bases of a transport that `trained` made of this one."""
+        self.bases, self.cells, self._projected = other.bases, other.cells, ()
+
     def train(self, part: int, radiance: torch.Tensor) -> None:
         """Extend a part's basis by an image, so that it shows tables like that of the image.
 
@@ -873,16 +890,3 @@ class Transport:
         deviation = sum(n * f.deviation for n, f in zip(size, frames, strict=True))
         level = sum(n * f.level for n, f in zip(size, frames, strict=True))
         return deviation / level if level > 0.0 else deviation
-
-
-def is_grey(scene: Scene) -> bool:
-    """Return whether all light of a scene is grey."""
-    image = scene.environment.image
-    colours = [np.asarray(c) for light in scene.lights for c in [_colour(light)]]
-    same = bool((image[..., 1:] == image[..., :1]).all())
-    return same and all(bool((c == c[0]).all()) for c in colours)
-
-
-def _colour(light: Light) -> tuple[float, float, float]:
-    """Return what sets a light's colour: its intensity or its irradiance."""
-    return light.intensity if isinstance(light, PointLight) else light.irradiance
