@@ -199,7 +199,10 @@ class Cache:
         The interpreter waits for the thread when it ends: otherwise a program that shows one frame
         would never fill the cache.
         """
-        thread = threading.Thread(target=self.write, args=(key, arrays), name="traitbrdf-cache")
+        # the thread of a preparation in the background, which may call this, is a daemon
+        thread = threading.Thread(
+            target=self.write, args=(key, arrays), name="traitbrdf-cache", daemon=False
+        )
         with contextlib.suppress(RuntimeError):  # the interpreter is ending
             thread.start()
 
