@@ -26,6 +26,7 @@ from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.library import Library
 from traitbrdf.space.material import Material
+from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.basis import Training, training_tables
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import light_tree
@@ -356,13 +357,41 @@ def prepare_view(
         Is told of each stage and fraction.
     """
     report("compiling", 0.0)
-    library, traits = palette.library, palette.traits
-    traits.reach(library.coordinates[0], {traits.names[0]: 0.1})  # else the first stroke waits
-    prepared = _transport(scene, settings, library, cache, fixed, known, begin, report)
+    library = palette.library
+
+    def begin_and_compile(report: Progress) -> None:
+        begin(report)
+        _compile_behind(palette)
+
+    prepared = _transport(scene, settings, library, cache, fixed, known, begin_and_compile, report)
+    if prepared.cached:
+        _compile_behind(palette)
     if settings.quality == "reference" or (settings.error is None and settings.fps is None):
         return prepared
     report("measuring", 1.0)
     return promised(prepared, library, settings)
+
+
+def compile_moves(library: Library, traits: TraitSpace) -> None:
+    """Compile the code that moves run, or load it; otherwise the first stroke would.
+
+    Parameters
+    ----------
+    library : Library
+    traits : TraitSpace
+    """
+    traits.reach(library.coordinates[0], {traits.names[0]: 0.1})
+
+
+def _compile_behind(palette: Palette) -> None:
+    """Compile moves in a thread, once there are first images.
+
+    Numba compiles one function at a time, so that images would wait for moves that come first. The
+    interpreter waits for the thread when it ends.
+    """
+    moves = functools.partial(compile_moves, palette.library, palette.traits)
+    with contextlib.suppress(RuntimeError):  # the interpreter is ending
+        threading.Thread(target=moves, name="traitbrdf-compile", daemon=False).start()
 
 
 def promised(prepared: Prepared, library: Library, settings: Settings) -> Prepared:
