@@ -12,7 +12,10 @@ venv: $(STAMP)
 $(STAMP): pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "make: $(PYTHON) not found; set PYTHON=..."; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "make: installing the package and what it needs into $(VENV); some minutes"
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	@echo "make: compiling what sessions run, so that none waits for it later; half a minute"
+	$(BIN)/traitbrdf compile
 	touch $(STAMP)
 
 # The path tracer that tests/test_peers.py and `traitbrdf bench --peers` compare with; it needs

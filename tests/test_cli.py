@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
-from collections.abc import Iterator
+import time
+import types
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,7 @@ from traitbrdf.bench.oracle import Oracle, draw_fragments, reference_values
 from traitbrdf.bench.records import ON_REQUEST, Record
 from traitbrdf.bench.rivals import texel_sum, texel_sum_torch
 from traitbrdf.bench.run import BENCHES
-from traitbrdf.cli import main
+from traitbrdf.cli import _Progress, main
 from traitbrdf.formats.images import read_image, write_exr
 
 MAPS = ("forest", "lobby", "night", "studio", "sunset", "venice", "warehouse", "workshop")
@@ -37,6 +40,15 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert said.startswith("traitbrdf: ")
     assert len(said.strip().splitlines()) == 1
     return said
+
+
+def wait_for(condition: Callable[[], bool]) -> bool:
+    """Whether it comes true within ten seconds."""
+    for _ in range(200):
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
 
 
 @pytest.mark.slow
@@ -117,11 +129,66 @@ def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "ground" in fails(capsys, "render", "--ground", "-1", "--size", "16", "--out", str(out))
 
 
-def test_the_demo_stands_on_the_ground(tmp_path: Path) -> None:
+def test_the_demo_stands_on_the_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--shape", "sphere", "--size", "32", "--out", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "report.json").read_text())
     assert set(report["parts"]) == {"sphere", "ground"}
     assert report["demo"]["changed_outside"] == 0
+    said = capsys.readouterr()
+    assert re.search(r"prepared \([\d.]+ s: loading [\d.]+ s, compiling", said.out)
+    assert re.search(r"after [\d.]+ s: preparation [\d.]+ s, pictures [\d.]+ s, all", said.out)
+    lines = said.err.splitlines()
+    assert all(re.fullmatch(r"[a-z ]+: \d+ %, \d+ s", line) for line in lines)
+    assert [line.split(":")[0] for line in lines][:3] == ["loading", "compiling", "tables"]
+
+
+class Clock:
+    """Seconds that pass when told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        clock = types.SimpleNamespace(perf_counter=lambda: self.now)
+        monkeypatch.setattr("traitbrdf.cli.time", clock)
+
+
+def test_progress_without_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line for each new stage, and otherwise one every few seconds."""
+    clock, progress = Clock(monkeypatch), _Progress()
+    for second in range(20):
+        clock.now = float(second)
+        progress(("near", "far")[second % 2], second / 20)
+    clock.now = 25.0
+    progress.__enter__().__exit__()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:3] == ["near: 0 %, 0 s", "far: 5 %, 1 s", "far: 35 %, 7 s"]
+    assert len(lines) <= 6
+    assert progress.seconds == {"near": 10.0, "far": 15.0}
+
+
+def test_progress_while_nothing_is_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock(monkeypatch)
+    with _Progress() as progress:
+        progress("compiling", 0.0)
+        clock.now = 6.0
+        assert wait_for(lambda: "compiling: 0 %, 6 s\n" in capsys.readouterr().err)
+
+
+def test_progress_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line that changes, and is gone at the end."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with pytest.raises(ValueError, match="wrong"), _Progress() as progress:
+        progress("near", 0.25)
+        raise ValueError("wrong")
+    said = capsys.readouterr().err
+    assert said.startswith("\rnear: 25 %, 0 s")
+    assert said.endswith(" \r")
+    assert "\n" not in said
 
 
 @pytest.mark.slow
@@ -412,7 +479,7 @@ def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFi
     assert "usage:" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["demo", "paint", "render", "info", "bench"])
+@pytest.mark.parametrize("command", ["demo", "paint", "render", "info", "compile", "bench"])
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         main([command, "--help"])

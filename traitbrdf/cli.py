@@ -1,11 +1,13 @@
 """The command line: ``traitbrdf demo | paint | render | angles | gallery | studio | info | bench``.
 
+``traitbrdf compile`` ends the installation.
 The exit status is 0 on success, 1 on failure with one readable line, 2 on wrong usage.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import json
 import math
@@ -144,6 +146,11 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
     info.set_defaults(run=_info)
 
+    ahead = commands.add_parser(
+        "compile", help="compile what the first session would wait for; once, half a minute"
+    )
+    ahead.set_defaults(run=_compile)
+
     timing = commands.add_parser("bench", help="measure errors and times")
     timing.add_argument(
         "names", nargs="*", metavar="NAME",
@@ -240,26 +247,84 @@ def _check_out(path: Path) -> None:
 
 
 class _Progress:
-    """A line of progress on standard error, if that is a terminal."""
+    """Says on standard error what is being done: stage, share of it, and seconds since the start.
+
+    On a terminal that is one line which changes. Elsewhere it is a line at each new stage, and
+    every few seconds.
+    """
 
     def __init__(self) -> None:
-        self.shown = sys.stderr.isatty()
+        self.seconds: dict[str, float] = {}
+        """What each stage took."""
+        self._terminal = sys.stderr.isatty()
+        self._start = self._told = self._since = time.perf_counter()
+        self._stage, self._fraction = "", 0.0
+        self._lock, self._end = threading.Lock(), threading.Event()
+        # a stage may report nothing for a while
+        self._clock = threading.Thread(target=self._tick, name="traitbrdf-progress", daemon=True)
+
+    def __enter__(self) -> _Progress:
+        self._clock.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._clock.join()
+        self._count()
+        if self._terminal:
+            print("\r" + " " * 50 + "\r", end="", file=sys.stderr, flush=True)
 
     def __call__(self, stage: str, fraction: float) -> None:
-        if self.shown:
-            print(f"\r{stage}: {100 * fraction:3.0f} %  ", end="", file=sys.stderr, flush=True)
+        with self._lock:
+            self._count()
+            fresh = stage not in self.seconds
+            self.seconds.setdefault(stage, 0.0)
+            self._stage, self._fraction = stage, fraction
+            if fresh or time.perf_counter() - self._told > self._pause:
+                self._tell()
 
-    def done(self) -> None:
-        if self.shown:
-            print("\r" + " " * 40 + "\r", end="", file=sys.stderr, flush=True)
+    @property
+    def _pause(self) -> float:
+        return 0.1 if self._terminal else 5.0
+
+    def _count(self) -> None:
+        now = time.perf_counter()
+        if self._stage:
+            self.seconds[self._stage] += now - self._since
+        self._since = now
+
+    def _tick(self) -> None:
+        while not self._end.wait(0.5):
+            with self._lock:
+                if self._stage and time.perf_counter() - self._told > self._pause:
+                    self._tell()
+
+    def _tell(self) -> None:
+        self._told = time.perf_counter()
+        line = f"{self._stage}: {100 * self._fraction:.0f} %, {self._told - self._start:.0f} s"
+        shown = f"\r{line:50}" if self._terminal else f"{line}\n"
+        with contextlib.suppress(OSError):  # nobody reads it any longer
+            print(shown, end="", file=sys.stderr, flush=True)
 
 
-def _prepared(scene: tb.Scene) -> tb.EditSession:
-    progress = _Progress()
+def _prepared(scene: tb.Scene, progress: _Progress) -> tb.EditSession:
+    progress("loading", 0.0)
     session = tb.EditSession(scene, progress=progress)
     session.prepare()
-    progress.done()
     return session
+
+
+def _compile(given: argparse.Namespace) -> int:
+    start = time.perf_counter()
+    with _Progress() as progress:
+        progress("loading", 0.0)
+        # imports torch, which most commands do not need
+        from traitbrdf.session.warmup import warm_up
+
+        fresh = warm_up(progress)
+    what = "compiled what sessions run" if fresh else "all is compiled already"
+    print(f"{what} ({time.perf_counter() - start:.1f} s)")
+    return 0
 
 
 def _demo(given: argparse.Namespace) -> int:
@@ -272,21 +337,26 @@ def _demo(given: argparse.Namespace) -> int:
         seconds[name] = now - start
         return now
 
-    clock = time.perf_counter()
+    # also into a file or a pipe, each line is written at once
+    say = functools.partial(print, flush=True)
+    start = clock = time.perf_counter()
     scene = _scene(given)
+    coverage = scene.coverage  # casts rays
     clock = step("scene", clock)
     light = "a procedural sky" if given.env is None else given.env.name
-    print(
+    say(
         f"{given.shape} under {light}, {scene.width}x{scene.height}, "
-        f"{100 * scene.coverage:.0f} % covered ({seconds['scene']:.2f} s)"
+        f"{100 * coverage:.0f} % covered ({seconds['scene']:.2f} s)"
     )
-    session = _prepared(scene)
+    with _Progress() as progress:
+        session = _prepared(scene, progress)
     clock = step("preparation", clock)
-    print(f"light transport prepared ({seconds['preparation']:.1f} s)")
+    stages = ", ".join(f"{stage} {took:.1f} s" for stage, took in progress.seconds.items())
+    say(f"light transport prepared ({seconds['preparation']:.1f} s: {stages})")
     session.assign(scene.shape.parts, given.material)
     before = session.render()
     clock = step("first frame", clock)
-    print(f"all parts made of {given.material} ({1e3 * seconds['first frame']:.1f} ms)")
+    say(f"all parts made of {given.material} ({1e3 * seconds['first frame']:.1f} ms)")
     part = "handle" if given.shape == "teapot" else "sphere"
     inside = scene.part_image == scene.parts.index(part)
     if not inside.any():
@@ -304,18 +374,19 @@ def _demo(given: argparse.Namespace) -> int:
     outside = np.ones(inside.shape, bool)
     outside.flat[scene.pixels[scene.part_slice(scene.parts.index(part))]] = False
     changed = int(np.count_nonzero((before != after).any(axis=-1) & outside))
-    print(
+    say(
         f"painted 'shiny' {DEMO_AMOUNT:+g} on "
         + ", ".join(f"the {name} ({amount:+.3f})" for name, amount in moved.items())
         + f" ({1e3 * seconds['stroke']:.2f} ms); its score rose by {risen:.3f}, "
         f"{100 * risen / DEMO_AMOUNT:.0f} % of what was asked for"
     )
-    print(
+    say(
         f"frame after the stroke: {1e3 * seconds['frame after the stroke']:.2f} ms; pixels "
         f"changed outside the {part}: {changed} of {int(outside.sum())}"
     )
+    clock = time.perf_counter()
     report = session.report()
-    print(
+    say(
         f"frame error, measured on probe pixels (mean relative L1): "
         f"{100 * report['frame_error']:.3f} % of the whole frame, "
         f"{100 * report['parts'][part]['error']:.3f} % of the {part}"
@@ -327,6 +398,7 @@ def _demo(given: argparse.Namespace) -> int:
     drawn = _draw_stroke(pictures[0], stroke)
     write_png(given.out / "side_by_side.png", np.concatenate([drawn, pictures[1]], axis=1))
     write_exr(given.out / "after.exr", after)
+    step("pictures", clock)
     report["demo"] = {
         "asked": DEMO_AMOUNT,
         "risen": risen,
@@ -336,7 +408,12 @@ def _demo(given: argparse.Namespace) -> int:
     }
     (given.out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
     names = "before.png, after.png, side_by_side.png, after.exr, report.json"
-    print(f"wrote {names} to {given.out}")
+    whole = time.perf_counter() - start
+    say(
+        f"wrote {names} to {given.out} after {whole:.1f} s: preparation "
+        f"{seconds['preparation']:.1f} s, pictures {seconds['pictures']:.1f} s, all else "
+        f"{whole - seconds['preparation'] - seconds['pictures']:.1f} s"
+    )
     return 0
 
 
@@ -391,10 +468,9 @@ def _render(given: argparse.Namespace) -> int:
     start = time.perf_counter()
     if given.reference:
         parts = session.scene.parts
-        progress = _Progress()
         brdfs = {p: session.brdf(p) for p in parts}
-        image = tb.reference.render(session.scene, brdfs, progress=progress)
-        progress.done()
+        with _Progress() as progress:
+            image = tb.reference.render(session.scene, brdfs, progress=progress)
         _write(given.out, image.astype(np.float32))
         error = "estimated error below 0.01 %"
     else:
