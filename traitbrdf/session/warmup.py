@@ -24,6 +24,7 @@ from traitbrdf.space.library import Library, default_library
 from traitbrdf.space.material import Material
 from traitbrdf.space.traits import default_traits
 from traitbrdf.transport.drafts import Draft
+from traitbrdf.transport.glances import Glances
 from traitbrdf.transport.nodes import NodeTransport
 from traitbrdf.transport.operator import Operator
 from traitbrdf.transport.universal import UniversalBasis
@@ -77,15 +78,17 @@ def warm_up_moves() -> None:
 
 
 def _images(library: Library, scene: Scene, operator: Operator, report: Progress) -> None:
-    """Render a draft and images at nodes, which is all that a preparation runs, too."""
+    """Render a draft, images at nodes and a glance, which is all that a preparation runs, too."""
     table = Material(library.coordinates[0], np.zeros(3)).values(library.embedding)
     tables = [table] * len(scene.parts)
     Draft(scene, operator.grid, tree=operator.tree).render(tables)
     report("compiling", 0.8)
     # no basis for frames that are looked at, but of the same types
-    basis = UniversalBasis(operator.grid, table, table.T.copy(), np.ones((3, 3), np.float32))
+    ones = np.ones((3, 3), np.float32)
+    basis = UniversalBasis(operator.grid, table, table.T.copy(), ones[0], ones)
     nodes = NodeTransport(scene, basis, tables, _SIZE, tree=operator.tree)
     nodes.refined(2 * _SIZE, tables).frame(tables)
+    Glances(operator.grid).frame(scene, tables, tree=operator.tree)
 
 
 @contextlib.contextmanager
