@@ -169,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     timing.add_argument(
         "--out", type=Path, metavar="FOLDER",
-        help="folder for trade.json and trade.png (the plot needs traitbrdf[plots])",
+        help="folder for trade.json, trade.png and live.png (plots need traitbrdf[plots])",
     )  # fmt: skip
     timing.add_argument("--quick", action="store_true", help="small sizes (some two minutes)")
     timing.add_argument("--json", type=Path, metavar="FILE", help="also write the records here")
@@ -611,10 +611,15 @@ def _info(given: argparse.Namespace) -> int:
 def _bench(given: argparse.Namespace) -> int:
     # imports torch and everything else, which other commands do not need
     from traitbrdf.bench.datasets import default_data
+    from traitbrdf.bench.live import live_edits
     from traitbrdf.bench.run import BENCHES, Bench, run
     from traitbrdf.bench.trade import trade
 
-    benches: dict[str, Bench] = {**BENCHES, "trade": functools.partial(trade, out=given.out)}
+    benches: dict[str, Bench] = {
+        **BENCHES,
+        "live": functools.partial(live_edits, out=given.out),
+        "trade": functools.partial(trade, out=given.out),
+    }
     for name in given.names:
         if name not in benches:
             raise ValueError(unknown_name("bench", name, tuple(benches)))

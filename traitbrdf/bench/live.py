@@ -1,12 +1,19 @@
-"""Time to the first live edit after a change of view or light."""
+"""Editing a scene whose view or light has just changed, or is being changed.
+
+All is measured in one run, beside the machine's own speed: its memory bandwidth, its rays a second
+and a fixed kernel. Machines differ from day to day; ratios to these compare.
+"""
 
 from __future__ import annotations
 
+import importlib
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,12 +22,15 @@ from numpy.typing import NDArray
 
 from traitbrdf.bench.datasets import maps
 from traitbrdf.bench.records import Record, Say
+from traitbrdf.bench.trade import bandwidth
 from traitbrdf.bench.transport import bench_scene
+from traitbrdf.formats.files import atomic_path
 from traitbrdf.scene.camera import Camera
+from traitbrdf.scene.scene import Scene
 from traitbrdf.session.cache import CACHE_BYTES, Cache
 from traitbrdf.session.editing import EditSession
 from traitbrdf.session.preparation import NODES, trained_members, universal_basis
-from traitbrdf.transport.operator import Operator
+from traitbrdf.transport.operator import Operator, light_tree
 
 _WAIT = 0.02  # seconds between two looks at a preparation
 
@@ -35,13 +45,39 @@ class _Stage(NamedTuple):
     edits: list[float]
 
 
-def live_edits(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
+_FRESH = """
+import time
+start = time.perf_counter()
+import sys
+from pathlib import Path
+from traitbrdf.bench.datasets import maps
+from traitbrdf.bench.transport import bench_scene
+from traitbrdf.session.editing import EditSession
+data = Path(sys.argv[1]) if sys.argv[1] else None
+found = {name: made for name, made in maps(data, data is None)}
+light = found.get("studio") or next(iter(found.values()))
+session = EditSession(bench_scene(light, int(sys.argv[2])))
+session.prepare(wait=False)
+while session.view.nodes is None and not session.ready:
+    time.sleep(0.01)
+session.assign(session.scene.shape.parts, "red-rubber")
+session.render(wait=False, exact=False)
+print(time.perf_counter() - start)
+session.cancel()
+"""
+
+
+def live_edits(
+    data: Path | None, quick: bool, say: Say, out: Path | None = None
+) -> Iterator[Record]:
     """Measure when edits are live after a change of view or light, and how wrong they are then.
 
     Parameters
     ----------
     data, quick, say
         As for `traitbrdf.bench.run.Bench`.
+    out : Path or None
+        Folder for live.png, the curve of error over time.
     """
     size, count = (64, 4) if quick else (512, 30)
     chosen = [one for one in maps(data, False) if one[0] in ("studio", "forest")]
@@ -50,7 +86,10 @@ def live_edits(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         os.environ |= {"TRAITBRDF_CACHE": folder, "TRAITBRDF_CACHE_BYTES": str(CACHE_BYTES)}
         try:
-            yield from _changes(chosen, size, count, say)
+            yield from _machine(chosen[0][1], size)
+            yield from _changes(chosen, size, count, say, out)
+            yield from _drags(chosen, 96 if quick else 256, say)
+            yield from _first_scene(data, size)
         finally:
             for thread in threading.enumerate():
                 if thread.name == "traitbrdf-cache":
@@ -62,7 +101,95 @@ def live_edits(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
                     os.environ[name] = value
 
 
-def _changes(chosen: list[Any], size: int, count: int, say: Say) -> Iterator[Record]:
+def _machine(environment: Any, size: int) -> Iterator[Record]:
+    """Measure the machine itself, alone."""
+    yield Record("memory bandwidth", bandwidth() / 1e9, "GB/s", how="sum of an array")
+    scene = bench_scene(environment, size)
+    rng = np.random.default_rng(0)
+    count = 1 << 20
+    toward = rng.normal(size=(count, 3))
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    at = np.sort(rng.integers(0, len(scene.normals), count))
+    seconds = min(_seconds(lambda: scene.visible(at, toward)) for _ in range(3))
+    yield Record("shadow rays", count / seconds / 1e6, "M/s", how="the teapot, all cores")
+    numbers = rng.random(1 << 22)
+    seconds = min(_seconds(lambda: np.sort(numbers)) for _ in range(3))
+    yield Record("fixed kernel", seconds, "s", how="numpy sorts 4 million numbers, one core")
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def _drags(chosen: list[Any], size: int, say: Say) -> Iterator[Record]:
+    """Measure frames while the camera or the map is dragged, with real materials."""
+    names = ("red-rubber", "blue-plastic", "gold-satin", "oak-varnished", "white-plastic")
+    for name, environment in chosen:
+        session = EditSession(bench_scene(environment, 2 * size), cache=False)
+        tree = light_tree(environment)
+        for change in ("camera", "map"):
+            seconds: list[float] = []
+            errors: list[float] = []
+            for material in names:
+                session.assign(session.scene.shape.parts, material)
+                session.glance(size)
+                for step in range(1, 13):
+                    if change == "camera":
+                        wanted: dict[str, Any] = {"camera": Camera.orbit(35 + 3 * step, 20 + step)}
+                    else:
+                        wanted = {"rotation": 0.06 * step}
+                    begun = time.perf_counter()
+                    session.look(**wanted)
+                    image, _ = session.glance(size)
+                    seconds.append(time.perf_counter() - begun)
+                    if step % 6 == 0:
+                        errors.append(_drag_error(session, image, size, tree))
+            error, rate = float(np.median(errors)), 1.0 / float(np.median(seconds))
+            say(
+                f"  {name}, {change}: slowest frame {1e3 * max(seconds):.0f} ms, greatest error "
+                f"{100 * max(errors):.1f} %"
+            )
+            full = size == 256
+            yield Record(
+                f"frames a second while the {change} is dragged", rate, "fps",
+                10.0 if full else None, rate >= 10.0 and error <= 0.08 if full else None,
+                error=error, how=f"{size}x{size} shown at {2 * size}x{2 * size}, map {name}",
+            )  # fmt: skip
+
+
+def _drag_error(session: EditSession, image: Any, size: int, tree: Any) -> float:
+    """Return the mean relative L1 of a glance at fragments that its pixels show alone."""
+    scene, embedding = session.scene, session.embedding
+    small = Scene.changed(scene, size=size, subsamples=1)
+    some = np.sort(np.random.default_rng(1).choice(len(small.pixels), 200, replace=False))
+    operator = Operator(small, embedding.grid_, 1.0, tree)
+    true = np.empty((len(some), 3))
+    for part, name in enumerate(small.parts):
+        mine = small.pixel_part[some] == part
+        if mine.any():
+            table = session.material(name).values(embedding)
+            true[mine] = np.einsum("pcc->pc", operator.images(some[mine], table))
+    # the enlarged image has four pixels for each
+    shown = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3)).reshape(-1, 3)[small.pixels[some]]
+    return float(np.abs(shown - true).mean() / true.mean())
+
+
+def _first_scene(data: Path | None, size: int) -> Iterator[Record]:
+    """Measure the first live edit of a fresh process."""
+    command = [sys.executable, "-c", _FRESH, "" if data is None else str(data), str(size)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
+    seconds = float(done.stdout.split()[-1])
+    yield Record(
+        "first live edit of a fresh process", seconds, "s", 4.0 if size == 512 else None,
+        seconds <= 4.0 if size == 512 else None, how=f"{size}x{size}, imports included",
+    )  # fmt: skip
+
+
+def _changes(
+    chosen: list[Any], size: int, count: int, say: Say, out: Path | None
+) -> Iterator[Record]:
     session = EditSession(bench_scene(chosen[0][1], size))
     library, cache = session.library, Cache.usual()
     if cache is not None:
@@ -77,6 +204,7 @@ def _changes(chosen: list[Any], size: int, count: int, say: Say) -> Iterator[Rec
     ]
     turned = Camera.orbit(-20.0, 25.0, zoom=session.scene.camera.zoom)
     session.draft()  # loads compiled code
+    curves: dict[str, list[tuple[float, float, float]]] = {}
     for name, environment in chosen:
         for change, wanted in (
             ("light", {"environment": environment, "rotation": 1.0}),
@@ -84,7 +212,14 @@ def _changes(chosen: list[Any], size: int, count: int, say: Say) -> Iterator[Rec
         ):
             before, stages = _follow(session, wanted, materials)
             errors = [_errors(session, stage, materials) for stage in stages]
+            if change == "light":
+                stages.append(_finished(session, materials))
+                errors.append(_errors(session, stages[-1], materials))
             session.cancel()
+            curves[f"{name}, {change}"] = [
+                (s.seconds, float(np.median(e)), float(np.percentile(e, 95)))
+                for s, e in zip(stages, errors, strict=True)
+            ]
             how = f"{size}x{size}, map {name}, {count} unseen materials, preparation running behind"
             for i, (stage, error) in enumerate(zip(stages, errors, strict=True)):
                 median, worst = float(np.median(error)), float(np.max(error))
@@ -94,6 +229,14 @@ def _changes(chosen: list[Any], size: int, count: int, say: Say) -> Iterator[Rec
                     f"greatest {100 * worst:.2f}; stated {100 * np.median(stage.stated):.2f})"
                 )
                 full = size == 512
+                if i == len(NODES):
+                    yield Record(
+                        f"prepared after a change of {change}", stage.seconds, "s",
+                        20.0 if full else None,
+                        stage.seconds <= 20.0 and median <= 0.003 if full else None,
+                        error=median, how=how,
+                    )  # fmt: skip
+                    continue
                 yield Record(
                     f"live after a change of {change}, {NODES[i]} nodes", stage.seconds, "s",
                     (1.5, 5.0)[i] if full else None,
@@ -107,6 +250,50 @@ def _changes(chosen: list[Any], size: int, count: int, say: Say) -> Iterator[Rec
                     edit <= 33.0 if full else None, error=median, how=how,
                 )  # fmt: skip
             yield Record(f"draft of an edit without nodes, {change}", before, "s", how=how)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        with atomic_path(out / "live.png") as temporary:
+            _plot(temporary, curves, count)
+        say(f"  wrote {out / 'live.png'}")
+
+
+def _plot(path: Path, curves: dict[str, list[tuple[float, float, float]]], count: int) -> None:
+    """Plot the error of frames over the time since a change."""
+    try:
+        figure = importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        raise RuntimeError("the plot needs matplotlib: pip install traitbrdf[plots]") from error
+    page = figure.Figure(figsize=(6.5, 4.2), layout="constrained")
+    axes = page.subplots()
+    for i, (label, points) in enumerate(curves.items()):
+        at = [point[0] for point in points]
+        axes.step(at, [100 * p[1] for p in points], f"C{i}o-", where="post", label=label)
+        axes.step(at, [100 * p[2] for p in points], f"C{i}:", where="post", lw=0.8)
+    axes.set(
+        xscale="log", yscale="log", xlabel="seconds since the change", ylabel="error of a frame, %"
+    )
+    axes.set_title(f"median of {count} unseen materials (dotted: 95th percentile)", fontsize=10)
+    axes.legend(fontsize=8)
+    page.savefig(path, dpi=110, format="png")
+
+
+def _finished(session: EditSession, materials: list[NDArray[np.float64]]) -> _Stage:
+    """Wait until the view is prepared; collect frames of all materials."""
+    session.prepare()
+    # the edits of the stages before took time from the preparation, which goes on behind
+    seconds = session.view.times["prepare"]
+    stage = _Stage(0, seconds, [], [], [])
+    places = _pixels(session)[1]
+    parts = session.scene.shape.parts
+    for material in materials:
+        begun = time.perf_counter()
+        session.assign(parts, material)
+        image = session.render(exact=False)
+        stage.edits.append(time.perf_counter() - begun)
+        stage.frames.append(image.reshape(-1, 3)[places])
+        stage.stated.append(session.frame_error or 0.0)
+        session.undo()
+    return stage
 
 
 def _follow(
