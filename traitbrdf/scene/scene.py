@@ -29,6 +29,8 @@ _GROUND_RADIUS = 2.0  # default, in radii of the shape
 RAYS_AT_ONCE = 1 << 16
 """Rays in one call, which takes some 15 ms; several calls run in parallel."""
 
+_FEW_RAYS = 1 << 12  # so few are not worth a thread
+
 _CREASE = math.cos(math.radians(40.0))  # a border lies between normals that differ by more
 _JUMP = 3.0  # pixels; a border lies between pixels further off each other's plane
 _LIGHT_MARGIN = 1e-5  # relative distance to a point light below which nothing hides it
@@ -518,8 +520,9 @@ def _in_parallel(work: Callable[[slice], None], chunks: list[slice]) -> None:
 
 
 def _chunks(count: int) -> list[slice]:
-    """Return slices that divide `count` rays into pieces of at most `RAYS_AT_ONCE`."""
-    return [slice(i, min(i + RAYS_AT_ONCE, count)) for i in range(0, count, RAYS_AT_ONCE)]
+    """Return slices that divide `count` rays among threads, at most `RAYS_AT_ONCE` in each."""
+    size = min(RAYS_AT_ONCE, max(_FEW_RAYS, -(-count // _threads())))
+    return [slice(i, min(i + size, count)) for i in range(0, count, size)]
 
 
 def sample_pattern(count: int) -> tuple[Float64, Float64]:

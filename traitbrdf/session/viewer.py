@@ -335,7 +335,7 @@ class Viewer:
         known = None if view.prepared is None else view.prepared.whole
         palette, settings = Palette(self.library, self.traits), self.settings
         library, cache, trees = self.library, self._cache, self._trees
-        present = [self.materials[part] for part in scene.parts]
+        owner = weakref.ref(self)
 
         def begin(report: Progress) -> None:
             """Prepare images at nodes, which show edits until the whole is prepared."""
@@ -343,12 +343,18 @@ class Viewer:
             if cache is None or known is not None or not shown:
                 return
             basis = universal_basis(library, settings.seed, cache, report)
-            decoded = {m: m.values(library.embedding) for m in present}
-            tables = [decoded[m] for m in present]
             nodes = view.nodes
             for count in NODES:
                 if nodes is not None and nodes.count >= count:
                     continue  # of a preparation of this view that was cancelled
+                session = owner()
+                if session is None:
+                    return
+                # nodes are placed for what the parts are made of by now
+                present = [session.materials[part] for part in scene.parts]
+                del session
+                decoded = {m: m.values(library.embedding) for m in present}
+                tables = [decoded[m] for m in present]
                 if nodes is None:
                     nodes = NodeTransport(
                         scene, basis, tables, count, tree=trees.of(scene.environment),
@@ -362,7 +368,7 @@ class Viewer:
         work = functools.partial(
             prepare_view, scene, settings, palette, cache, fixed, known, begin
         )  # fmt: skip
-        return Preparation(work, publish, self.progress, weakref.ref(self))
+        return Preparation(work, publish, self.progress, owner)
 
     def cancel(self) -> None:
         """Cancel a running preparation, which ends soon; the session goes on as before it."""

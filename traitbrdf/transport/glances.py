@@ -9,6 +9,7 @@ leaving one out would show. Under a light that turns, the interpolation stays as
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -20,24 +21,24 @@ from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.interpolation import interpolate_nodes, kriging
 from traitbrdf.transport.lighttree import LightTree
-from traitbrdf.transport.nodes import NodeFrame, places_of
+from traitbrdf.transport.nodes import NodeFrame
 from traitbrdf.transport.operator import Operator
-from traitbrdf.transport.reflections import Regression, blurred, reflections, slopes_of
+from traitbrdf.transport.reflections import Regression, blurred, reflections
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-NODES = 500
+NODES = 400
 """Nodes of a frame."""
 
-NEIGHBOURS = 5
+NEIGHBOURS = 4
 """Nodes that a fragment is interpolated from."""
 
-RESOLUTION = 0.15
+RESOLUTION = 0.12
 """Of the light, as for `Operator`."""
 
-PROBES = (24, 0.35)
+PROBES = (20, 0.35)
 """Fragments that measure the error, and the resolution of the light there."""
 
 _NEW = 0.15
@@ -51,6 +52,9 @@ _CANDIDATES = 4000
 
 _EVEN = 0.1
 """Share of the mean error that every place counts as having, so that none is left out."""
+
+_NORMAL = 2.2
+"""How much the normal counts beside the position: as with its mirror direction, sqrt(1 + 4)."""
 
 _APART = 100.0
 """How far parts lie from each other: far more than any two fragments of one part."""
@@ -127,82 +131,86 @@ class Glances:
         mirrors: Sequence[Float64] | None,
         tree: LightTree | None,
     ) -> NodeFrame:
-        small, places, nodes = self._seen(scene)
-        operator = Operator(small, self.grid, RESOLUTION, tree)
-        count = len(small.pixels)
-        shown = np.zeros((len(nodes.at), 3), np.float32)
-        probes = np.sort(self._rng.choice(count, min(PROBES[0], count), replace=False))
-        finer = Operator(small, self.grid, PROBES[1], operator.tree)
-        exact = np.zeros((len(probes), 3), np.float32)
-        for one in {id(table): table for table in tables}.values():
-            parts = np.array([table is one for table in tables])
-            for at, out, by in ((nodes.at, shown, operator), (probes, exact, finer)):
-                mine = np.flatnonzero(parts[small.pixel_part[at]])
-                if len(mine):
-                    images = by.images(at[mine], one, by.core)
-                    out[mine] = np.einsum("pcc->pc", images) / small.weights[at[mine], None]
-        image = scene.environment.image
-        if self._levels is None or self._levels[0] is not image:
-            self._levels = image, blurred(scene.environment)
-        columns = reflections(small, self._levels[1])
+        small = self._small(scene)
+        count = len(small.pixels)  # casts the camera's rays
+        with ThreadPoolExecutor(1, "traitbrdf-glance") as pool:
+            # one core looks up the map while the other begins with the nodes
+            looked_up = pool.submit(reflections, small, self._blurred(scene))
+            behind = pool.submit(_behind, small)
+            places, nodes = self._placed(scene, small)
+            operator = Operator(small, self.grid, RESOLUTION, tree)
+            shown = np.zeros((len(nodes.at), 3), np.float32)
+            probes = np.sort(self._rng.choice(count, min(PROBES[0], count), replace=False))
+            finer = Operator(small, self.grid, PROBES[1], operator.tree)
+            exact = np.zeros((len(probes), 3), np.float32)
+            for one in {id(table): table for table in tables}.values():
+                parts = np.array([table is one for table in tables])
+                for at, out, by in ((nodes.at, shown, operator), (probes, exact, finer)):
+                    mine = np.flatnonzero(parts[small.pixel_part[at]])
+                    if len(mine):
+                        images = by.images(at[mine], one, by.core)
+                        out[mine] = np.einsum("pcc->pc", images) / small.weights[at[mine], None]
+            columns, picture = looked_up.result(), behind.result()
         known, weights = kriging(places, nodes.at, nodes.at, NEIGHBOURS, leave_out=True)
-        drift = np.zeros((count, 3), np.float32)
+        radiance = np.zeros((count, 3), np.float32)
         for one in {id(table): table for table in tables}.values():
             parts = np.array([table is one for table in tables])
             mine = np.flatnonzero(parts[small.pixel_part[nodes.at]])
-            if len(mine):
-                order = np.searchsorted(mine, known[mine])  # neighbours are of the same part
-                found = Regression.of(columns[nodes.at[mine]], order, weights[mine])
-                seen = torch.from_numpy(shown[mine].T.copy())[:, :, None]
-                slope = slopes_of(found.gram, torch.bmm(found.moments, seen))[..., 0].numpy()
-                every = parts[small.pixel_part]
-                drift[every] = np.einsum("pcd,cd->pc", columns[every], slope)
-        shown -= drift[nodes.at]
-        radiance = drift
-        interpolate_nodes(radiance, shown, nodes.near, nodes.weights)
-        np.maximum(radiance, 0.0, out=radiance)
+            if not len(mine):
+                continue
+            order = np.searchsorted(mine, known[mine])  # neighbours are of the same part
+            found = Regression.of(columns[nodes.at[mine]], order, weights[mine])
+            slopes = found.slopes(shown[mine])
+            shown[mine] -= np.einsum("ncd,cd->nc", columns[nodes.at[mine]], slopes)
+            every = np.flatnonzero(parts[small.pixel_part])
+            part = np.empty((len(every), 3), np.float32)
+            interpolate_nodes(
+                part, shown, nodes.near[every], nodes.weights[every], columns[every], slopes
+            )
+            radiance[every] = part
         deviation, level = float(np.abs(radiance[probes] - exact).sum()), float(exact.sum())
-        left_out = np.einsum("nk,nkc->nc", weights, shown[known]) if known.shape[1] else 0.0
+        left_out = np.einsum("nk,nkc->nc", weights, shown[known])
         self._nodes = nodes._replace(error=np.abs(left_out - shown).mean(axis=1))
         if mirrors is not None and any(np.any(m) for m in mirrors):
             weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[small.pixel_part]
             radiance = radiance + weight * operator.mirror(np.arange(count))
-        picture = np.zeros((small.height * small.width, 3), np.float32)
-        open_ = np.flatnonzero(small.uncovered)
-        _, rays = small.camera.rays(small.shape, small.height, small.width)
-        behind = small.environment.backdrop(rays.reshape(-1, 3)[open_])
-        picture[open_] = behind * small.uncovered[open_, None]
-        covered = radiance * small.weights[:, None].astype(np.float32)
-        if np.any(np.diff(np.sort(small.pixels)) == 0):
-            np.add.at(picture, small.pixels, covered)
-        else:
-            picture[small.pixels] += covered
+        # with one sample a pixel, no pixel has two fragments
+        picture[small.pixels] += radiance * small.weights[:, None].astype(np.float32)
         frame = picture.reshape(small.height, small.width, 3)
         return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
 
-    def _seen(self, scene: Scene) -> tuple[Scene, Float32, _Nodes]:
-        """Return the scene at a small size, where its fragments lie, and nodes."""
-        last, known = self._scene, self._nodes
-        same = self._of is not None and _same_view(self._of, scene)
-        if same and last is not None and known is not None and self._places is not None:
+    def _blurred(self, scene: Scene) -> list[torch.Tensor]:
+        """Return the scene's map at several sizes."""
+        image = scene.environment.image
+        if self._levels is None or self._levels[0] is not image:
+            self._levels = image, blurred(scene.environment)
+        return self._levels[1]
+
+    def _small(self, scene: Scene) -> Scene:
+        """Return the scene at a small size: with the last one's fragments under another light."""
+        if self._of is not None and self._scene is not None and _same_view(self._of, scene):
             light = {name: getattr(scene, name) for name in ("environment", "lights", "shadows")}
-            self._of, self._scene = scene, last.changed(**light)
-            return self._scene, self._places, known
+            return self._scene.changed(**light)
         scale = min(1.0, self.size / max(scene.height, scene.width))
         shape = (max(1, round(scene.height * scale)), max(1, round(scene.width * scale)))
-        small = scene.changed(size=shape, subsamples=1)
-        # fragments are interpolated from nodes of their own part
-        apart = _APART * small.pixel_part[:, None].astype(np.float32)
-        places = np.concatenate([places_of(small), apart], axis=1)
+        return scene.changed(size=shape, subsamples=1)
+
+    def _placed(self, scene: Scene, small: Scene) -> tuple[Float32, _Nodes]:
+        """Return where fragments lie, and nodes."""
+        last, known, first = self._scene, self._nodes, self._of is None
+        same = self._of is not None and _same_view(self._of, scene)
+        self._of, self._scene = scene, small
+        if same and known is not None and self._places is not None:
+            return self._places, known
+        places = _places(small)
         kept, error = np.zeros(0, np.int64), np.zeros(0)
-        first = self._of is None
         if last is not None and known is not None:
             kept, error = _carried(last, known, small)
         at = self._chosen(places, kept, error, _FIRST if first else 1.0 - _NEW)
-        near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS, loose=0.3)
-        self._of, self._scene, self._places = scene, small, places
+        near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS, loose=0.5)
+        self._places = places
         self._nodes = _Nodes(at, near.astype(np.int32), weights, np.zeros(len(at)))
-        return small, places, self._nodes
+        return places, self._nodes
 
     def _chosen(self, places: Float32, kept: Int64, error: Float64, share: float) -> Int64:
         """Return nodes (n,): at most a share of known ones, and fresh ones where needed."""
@@ -224,6 +232,28 @@ class Glances:
             return kept
         chosen = self._rng.choice(some, fresh, replace=False, p=score / score.sum())
         return np.concatenate([kept, chosen])
+
+
+def _behind(small: Scene) -> Float32:
+    """Return the map (pixels, 3) behind the object, where it is seen."""
+    picture = np.zeros((small.height * small.width, 3), np.float32)
+    open_ = np.flatnonzero(small.uncovered)
+    y, x = np.divmod(open_, small.width)
+    rays = small.camera.through(small.height, small.width, x + 0.5, y + 0.5)
+    picture[open_] = small.environment.backdrop(rays) * small.uncovered[open_, None]
+    return picture
+
+
+def _places(small: Scene) -> Float32:
+    """Return where fragments lie (P, 7): position, normal and part.
+
+    The mirror direction, which nodes of finished frames respect as well, turns twice as far as the
+    normal: fewer dimensions are searched faster.
+    """
+    middle = small.offsets[:-1]
+    positions = 2.0 * small.positions[middle] / small.shape.radius
+    apart = _APART * small.pixel_part[:, None]
+    return np.concatenate([positions, _NORMAL * small.normals[middle], apart], axis=1).astype("f4")
 
 
 def _same_view(one: Scene, other: Scene) -> bool:

@@ -51,17 +51,23 @@ def kriging(
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
-def interpolate_nodes(out: Any, shown: Any, near: Any, weights: Any) -> None:
-    """Add to fragments what is interpolated from nodes, within what the nodes around show.
+def interpolate_nodes(
+    out: Any, shown: Any, near: Any, weights: Any, columns: Any, slopes: Any
+) -> None:
+    """Set what fragments show, from nodes and reflections; never negative.
 
-    Weights of kriging may be negative: at the edge of a shadow the sum would overshoot.
+    What is interpolated stays within what the nodes around show. Weights of kriging may be
+    negative: at the edge of a shadow their sum would overshoot.
 
     Parameters
     ----------
-    out : (P, 3) float32, to which it is added
+    out : (P, 3) float32, which is set
     shown : (n, 3) float32
+        What nodes show beside reflections.
     near : (P, k) int32 nodes of each fragment
     weights : (P, k) float32
+    columns : (P, 3, D) float32 reflections
+    slopes : (3, D) float32 coefficients of them
     """
     for p in numba.prange(len(out)):
         for c in range(3):
@@ -70,8 +76,12 @@ def interpolate_nodes(out: Any, shown: Any, near: Any, weights: Any) -> None:
                 value = shown[near[p, k], c]
                 total += weights[p, k] * value
                 low, high = min(low, value), max(high, value)
+            sharp = f32(0.0)
+            for d in range(columns.shape[2]):
+                sharp += columns[p, c, d] * slopes[c, d]
             if near.shape[1] > 0:
-                out[p, c] += min(max(total, low), high)
+                sharp += min(max(total, low), high)
+            out[p, c] = max(sharp, f32(0.0))
 
 
 @numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)

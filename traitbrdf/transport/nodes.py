@@ -97,17 +97,21 @@ class Nodes(NamedTuple):
     left_out: tuple[Int64, Float32]
 
 
-class _Read(NamedTuple):
-    """What a frame reads of a part, as tensors; see `Nodes`.
+class _Drawn(NamedTuple):
+    """A part as it was drawn last.
 
     Attributes
     ----------
-    images : (3, n, R) float32
-    columns : (3, P, D) float32
+    table : (cells, 3) float32
+    radiance : (P, 3) float32
+    deviation, level : float
+        Sums of |I - I_exact| and of I_exact over its fragments, measured on the probes.
     """
 
-    images: torch.Tensor
-    columns: torch.Tensor
+    table: Float32
+    radiance: Float32
+    deviation: float
+    level: float
 
 
 class NodeTransport:
@@ -166,7 +170,10 @@ class NodeTransport:
         backdrop = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
         self._backdrop = torch.from_numpy(np.ascontiguousarray(backdrop, dtype=np.float32))
         self._mirror: torch.Tensor | None = None
+        self._projection = torch.from_numpy(np.ascontiguousarray(basis.projection))
         self._columns = reflections(scene)
+        self._images: list[torch.Tensor] = []
+        self._drawn: dict[int, _Drawn] = {}
         none = np.zeros(0, np.int64), np.zeros((0, 3, basis.tables.shape[1]), np.float32)
         nothing = np.zeros((0, NEIGHBOURS), np.int32), np.zeros((0, NEIGHBOURS), np.float32)
         alone = np.zeros((0, 0), np.int64), np.zeros((0, 0), np.float32)
@@ -225,30 +232,25 @@ class NodeTransport:
             Weight of a perfect mirror beside each table.
         """
         scene = self.scene
-        radiance = torch.empty((len(scene.pixels), 3))
         deviation = level = 0.0
-        shown = self._at_nodes(tables)
+        slopes: dict[tuple[int, int], Float32] = {}
+        shown: dict[tuple[int, int], list[Float32]] = {}
         for part, table in enumerate(tables):
             span = scene.part_slice(part)
             if span.start == span.stop:
                 continue
-            on_ground = part >= len(scene.shape.parts)
-            values, slope = shown[id(table), int(on_ground)]
-            _, columns = self._read[part]
-            near, weights = self.parts[part].near, self.parts[part].weights
-            own = values[part - (len(scene.shape.parts) if on_ground else 0)]
-            rest = own - torch.bmm(columns[:, self._at[part]], slope)
-            smooth = torch.bmm(columns, slope)[..., 0].T.contiguous()
-            interpolate_nodes(smooth.numpy(), rest[..., 0].T.contiguous().numpy(), near, weights)
-            # a fragment shows the share of its pixel that it covers
-            radiance[span] = smooth.clamp_min_(0.0).mul_(self._covered[span])
-            cells = torch.from_numpy(table).T.contiguous()
-            probes = slice(*np.searchsorted(self._probes, (span.start, span.stop)).tolist())
-            exact = torch.stack([self._rows[c, probes] @ cells[c] for c in range(3)], dim=1)
-            stands_for = (span.stop - span.start) / len(exact)
-            found = radiance[self._probes[probes]]
-            deviation += stands_for * float((found - exact).abs().sum())
-            level += stands_for * float(exact.sum())
+            known = self._drawn.get(part)
+            if known is None or known.table is not table:
+                group = self._groups[int(part >= len(scene.shape.parts))]
+                key = id(table), group.start
+                if key not in shown:
+                    shown[key], slopes[key] = self._at_nodes(table, group)
+                values = shown[key][part - group.start]
+                known = self._drawn[part] = self._draw(part, table, values, slopes[key])
+            deviation += known.deviation
+            level += known.level
+        pieces = [self._drawn[part].radiance for part in sorted(self._drawn)]
+        radiance = torch.from_numpy(np.concatenate([np.zeros((0, 3), np.float32), *pieces]))
         if mirrors is not None and any(np.any(m) for m in mirrors):
             if self._mirror is None:
                 self._mirror = torch.from_numpy(self.operator.mirror(np.arange(len(radiance))))
@@ -258,29 +260,42 @@ class NodeTransport:
         frame = image.reshape(scene.height, scene.width, 3).numpy()
         return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
 
-    def _at_nodes(
-        self, tables: Sequence[Float32]
-    ) -> dict[tuple[int, int], tuple[list[torch.Tensor], torch.Tensor]]:
-        """Return what nodes show, for each table (by its id) and group of parts that has it.
+    def _draw(self, part: int, table: Float32, shown: Float32, slopes: Float32) -> _Drawn:
+        """Interpolate a part from its nodes (n, 3), and measure its error."""
+        span, nodes = self.scene.part_slice(part), self.parts[part]
+        columns = self._columns[span]
+        rest = shown - np.einsum("ncd,cd->nc", self._columns[nodes.at], slopes)
+        radiance = np.empty((span.stop - span.start, 3), np.float32)
+        interpolate_nodes(radiance, rest, nodes.near, nodes.weights, columns, slopes)
+        # a fragment shows the share of its pixel that it covers
+        radiance *= self._covered[span]
+        probes = slice(*np.searchsorted(self._probes, (span.start, span.stop)).tolist())
+        cells = torch.from_numpy(table).T.contiguous()
+        exact = torch.stack([self._rows[c, probes] @ cells[c] for c in range(3)], dim=1).numpy()
+        stands_for = (span.stop - span.start) / len(exact)
+        off = np.abs(radiance[self._probes[probes] - span.start] - exact)
+        return _Drawn(
+            table, radiance, stands_for * float(off.sum()), stands_for * float(exact.sum())
+        )
 
-        That is the radiance (3, n, 1) of the nodes of each part of the group, and coefficients
-        (3, D, 1) of reflections. These are found on all nodes of the group, whatever its parts are
-        made of: small parts have few, and an edit of one part must not change another.
+    def _at_nodes(self, table: Float32, group: range) -> tuple[list[Float32], Float32]:
+        """Return what the nodes (n, 3) of each part of a group show, and coefficients (3, D).
+
+        These are found on all nodes of the group, whatever its parts are made of: small parts have
+        few, and an edit of one part must not change another.
         """
-        found = {}
+        cells = torch.from_numpy(table).T.contiguous()
+        coefficients = [self._projection @ cells[c] for c in range(3)]
         width = self._columns.shape[2]
-        for table in {id(table): table for table in tables}.values():
-            coefficients = torch.from_numpy(self.basis.projection @ table).T[:, :, None]
-            for g, group in enumerate(self._groups):
-                if not any(tables[part] is table for part in group):
-                    continue
-                gram, moments = torch.zeros((3, width, width)), torch.zeros((3, width, 1))
-                values = [torch.bmm(self._read[part].images, coefficients) for part in group]
-                for part, shown in zip(group, values, strict=True):
-                    gram += self.parts[part].regression.gram
-                    moments += torch.bmm(self.parts[part].regression.moments, shown)
-                found[id(table), g] = values, slopes_of(gram, moments)
-        return found
+        gram, moments = np.zeros((3, width, width), np.float32), np.zeros((3, width), np.float32)
+        values = []
+        for part in group:
+            images, equations = self._images[part], self.parts[part].regression
+            shown = torch.stack([images[c] @ coefficients[c] for c in range(3)], dim=1).numpy()
+            values.append(shown)
+            gram += equations.gram
+            moments += np.einsum("cdn,nc->cd", equations.moments, shown)
+        return values, slopes_of(gram, moments)
 
     @property
     def _groups(self) -> tuple[range, range]:
@@ -359,21 +374,15 @@ class NodeTransport:
     def _join(self, report: Progress) -> None:
         """Prepare the interpolation, and what frames read."""
         report("nodes", 0.9)
-        self._read = []
-        covered = self.scene.weights.astype(np.float32)
+        self._images, self._drawn = [], {}
         for part, nodes in enumerate(self.parts):
             span = self.scene.part_slice(part)
             every = np.arange(span.start, span.stop)
             at, weights = kriging(self._places, nodes.at, every, NEIGHBOURS)
             self.parts[part] = nodes._replace(near=at.astype(np.int32), weights=weights)
             images = np.ascontiguousarray(nodes.images.transpose(1, 0, 2))
-            columns = np.ascontiguousarray(self._columns[span].transpose(1, 0, 2))
-            self._read.append(_Read(torch.from_numpy(images), torch.from_numpy(columns)))
-        self._at = [
-            torch.from_numpy(nodes.at - self.scene.part_slice(part).start)
-            for part, nodes in enumerate(self.parts)
-        ]
-        self._covered = torch.from_numpy(covered)[:, None]
+            self._images.append(torch.from_numpy(images))
+        self._covered = self.scene.weights[:, None].astype(np.float32)
         report("nodes", 1.0)
 
     def _left_out(self, nodes: Nodes, shown: Sequence[Float32]) -> NDArray[np.float64]:
@@ -383,9 +392,7 @@ class NodeTransport:
         error = np.full(len(nodes.at), 1e-12)
         for coefficients in shown:
             radiance = np.einsum("ncr,rc->nc", nodes.images, coefficients)
-            seen = torch.from_numpy(np.ascontiguousarray(radiance.T))[:, :, None]
-            gram, moments = nodes.regression
-            slope = slopes_of(gram, torch.bmm(moments, seen))[..., 0].numpy()
+            slope = nodes.regression.slopes(radiance)
             rest = radiance - np.einsum("ncd,cd->nc", columns, slope)
             found = np.einsum("nk,nkc->nc", weights, rest[near])
             error += np.abs(found - rest).mean(axis=1) / max(float(radiance.mean()), 1e-30)

@@ -98,8 +98,8 @@ class Regression(NamedTuple):
         Takes the radiance of the nodes to the right-hand side.
     """
 
-    gram: torch.Tensor
-    moments: torch.Tensor
+    gram: Float32
+    moments: Float32
 
     @classmethod
     def of(cls, columns: Float32, near: Int64, weights: Float32) -> Regression:
@@ -127,19 +127,23 @@ class Regression(NamedTuple):
             for c in range(3):
                 design = rest @ columns[:, c].astype(np.float64)
                 gram[c], moments[c] = design.T @ design, (rest.T @ design).T
-        return cls(torch.from_numpy(gram), torch.from_numpy(moments))
+        return cls(gram, moments)
+
+    def slopes(self, shown: Float32) -> Float32:
+        """Return the coefficients (3, D) of reflections for the radiance (n, 3) of the nodes."""
+        return slopes_of(self.gram, np.einsum("cdn,nc->cd", self.moments, shown))
 
 
-def slopes_of(gram: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
-    """Return the coefficients (3, D, 1) of reflections.
+def slopes_of(gram: Float32, moments: Float32) -> Float32:
+    """Return the coefficients (3, D) of reflections.
 
     Parameters
     ----------
-    gram : (3, D, D) tensor
-    moments : (3, D, 1) tensor
+    gram : (3, D, D) float32
+    moments : (3, D) float32
         Right-hand side: `Regression.moments` times the radiance of the nodes.
     """
-    ridge = _RIDGE * gram.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(1e-30)
-    identity = torch.eye(gram.shape[1])
-    found: torch.Tensor = torch.linalg.solve(gram + ridge[:, None, None] * identity, moments)
+    ridge = _RIDGE * np.maximum(gram.diagonal(axis1=1, axis2=2).max(axis=1), 1e-30)
+    whole = gram + ridge[:, None, None] * np.eye(gram.shape[1])
+    found: Float32 = np.linalg.solve(whole, moments[..., None])[..., 0].astype(np.float32)
     return found
