@@ -170,7 +170,7 @@ def inherit(
         Set to 0 (hidden), 1 (visible), 2 (below the horizon) or 3 (a ray is needed).
     normals : (m, 3) unit
     toward : (D, 3) unit directions towards the light
-    known : (rows, D) uint8 bits that were found before
+    known : (rows, D / 4) uint8 bits that were found before, four to a byte
     around : (m, 4) int32 neighbouring rows of `known`, -1 for none
     least : int
         With fewer rows around, every direction above the horizon needs a ray.
@@ -194,7 +194,7 @@ def inherit(
             if have >= least and not sharp[d]:
                 for k in range(4):
                     if around[p, k] >= 0:
-                        b = known[around[p, k], d]
+                        b = (known[around[p, k], d >> 2] >> (2 * (d & 3))) & 3
                         if b == 2 or (value != 3 and b != value):
                             value = 3
                             break
@@ -260,7 +260,7 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
     Parameters
     ----------
     out : (m,) float32, which is set
-    bits : (rows, D) uint8, 0 hidden, 1 visible, 2 below the horizon
+    bits : (rows, D / 4) uint8, four to a byte: 0 hidden, 1 visible, 2 below the horizon
     cells : (m, 4) int32 rows of the corners, -1 for none
     normals : (m, 3) unit
     toward : (D, 3) unit directions towards the light
@@ -268,7 +268,7 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
     """
     for p in numba.prange(len(cells)):
         total, unlike = 1e-30, 0.0
-        for d in range(bits.shape[1]):
+        for d in range(len(toward)):
             cos = (
                 normals[p, 0] * toward[d, 0]
                 + normals[p, 1] * toward[d, 1]
@@ -280,7 +280,7 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
             blocked = 0
             for k in range(4):
                 if cells[p, k] >= 0:
-                    b = bits[cells[p, k], d]
+                    b = (bits[cells[p, k], d >> 2] >> (2 * (d & 3))) & 3
                     seen += b == 1
                     blocked += b == 0
             if seen > 0:

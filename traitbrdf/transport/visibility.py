@@ -321,14 +321,19 @@ class Visibility:
         self._sharp = cut.share > 0.02  # suns, which cast sharp shadows
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
         self._middle = middle
-        self._bits = np.zeros((0, len(cut.share)), np.uint8)
+        self._bits = np.zeros((0, (len(cut.share) + 3) // 4), np.uint8)  # four to a byte
         words = (len(cut.share) + 63) // 64
         self._masks = tuple(np.zeros((0, words), np.uint64) for _ in range(3))
 
     @property
-    def bits(self) -> NDArray[np.uint8]:
-        """Bits (rows, D): 0 hidden, 1 visible, 2 below the horizon."""
+    def packed(self) -> NDArray[np.uint8]:
+        """Bits (rows, D / 4), four to a byte: 0 hidden, 1 visible, 2 below the horizon."""
         return self._bits[: self.rows]
+
+    def of_node(self, node: int) -> NDArray[np.uint8]:
+        """Return the bits (rows,) of one node."""
+        byte, place = divmod(node, 4)
+        return np.asarray((self.packed[:, byte] >> (2 * place)) & 3, np.uint8)
 
     @property
     def masks(self) -> tuple[NDArray[np.uint64], ...]:
@@ -416,7 +421,7 @@ class Visibility:
             self._bits = _grown(self._bits, size)
             self._masks = tuple(_grown(a, size) for a in self._masks)
         rows = slice(self.rows, need)
-        self._bits[rows] = bits
+        self._bits[rows] = _four_to_a_byte(bits)
         pack_bits(bits, self.cut.neighbours, *(a[rows] for a in self._masks))
         self.rows = need
         return np.arange(rows.start, rows.stop)
@@ -425,6 +430,13 @@ class Visibility:
         """Replace the bits that are 3 by casting rays from the samples (m,)."""
         at, node = np.nonzero(bits == 3)
         bits[at, node] = self.scene.visible(sample[at], self.toward[node])
+
+
+def _four_to_a_byte(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pack bits (m, D) from 0 to 3 into bytes (m, D / 4), the first lowest."""
+    whole = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 4))).reshape(len(bits), -1, 4)
+    packed = whole[..., 0] | whole[..., 1] << 2 | whole[..., 2] << 4 | whole[..., 3] << 6
+    return np.asarray(packed, np.uint8)
 
 
 def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
@@ -567,7 +579,7 @@ class Plan:
             rows = casts.row_of[span]
             mask_rows = rows[corners].astype(np.int32)
             mask_rows[alone, 1:] = -1
-            free = (casts.bits[:, :] == 0).sum(axis=1) == 0
+            free = ~(casts.masks[0][: casts.rows] != 0).any(axis=1)
             # where nothing hides anything around, there is nothing to look up
             clear = np.where(mask_rows >= 0, free[mask_rows], True).all(axis=1) & single
             mask_rows[clear] = -1
@@ -695,14 +707,14 @@ def _shadows_agree(
     first[which.reshape(-1)[::-1]] = np.arange(len(which))[::-1]
     unlike = np.empty(len(cells), np.float32)
     disagreement(
-        unlike, visibility.bits, cells, normals[some[first]],
+        unlike, visibility.packed, cells, normals[some[first]],
         visibility.toward, visibility.cut.share,
     )  # fmt: skip
     agree: NDArray[np.bool_] = (unlike < loose**1.5 * _UNEVEN)[which.reshape(-1)]
     if sharp is not None:
         nodes, own = sharp
         for k, node in enumerate(nodes):
-            bit = np.append(visibility.bits[:, node], np.uint8(2))  # for row -1: unknown
+            bit = np.append(visibility.of_node(int(node)), np.uint8(2))  # for row -1: unknown
             # a corner below the light's horizon says nothing about its shadow
             same = np.where(rows >= 0, (bit[rows] == own[some, k, None]) | (bit[rows] == 2), True)
             agree &= same.all(axis=1)
