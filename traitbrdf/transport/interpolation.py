@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -110,13 +111,13 @@ def kriging_weights(out: Any, points: Any, at: Any, near: Any) -> None:
                 square = 0.0
                 for d in range(points.shape[1]):
                     square += (points[near[i, a], d] - points[near[i, b], d]) ** 2
-                system[a, b] = system[b, a] = square**0.75
+                system[a, b] = system[b, a] = math.sqrt(square) * math.sqrt(math.sqrt(square))
             square = 0.0
             for d in range(points.shape[1]):
                 square += (points[near[i, a], d] - at[i, d]) ** 2
             system[a, a] = -1e-9
             system[a, k] = system[k, a] = 1.0
-            system[a, k + 1] = square**0.75
+            system[a, k + 1] = math.sqrt(square) * math.sqrt(math.sqrt(square))
         system[k, k + 1] = 1.0
         for a in range(k + 1):  # Gaussian elimination with row pivots
             pivot = a
