@@ -102,6 +102,28 @@ def test_materials_of_parts_are_apart():
     assert np.abs(frames[1] - frames[0])[~inside].mean() < 0.02 * frames[0][~inside].mean()
 
 
+def test_small_parts_show_their_own_material(monkeypatch):
+    """With fewer nodes than parts would need, each of another material."""
+    monkeypatch.setattr("traitbrdf.transport.glances.NODES", 8)
+    seen = scene(size=40, ground=False)
+    flats = [np.full((GRID.size, 3), 0.02 * 3.0**i, np.float32) for i in range(len(seen.parts))]
+    glances = Glances(GRID)
+    for angle in (0.0, 3.0, 60.0):
+        turned_scene = seen.changed(camera=turned(angle))
+        image, said = glances.frame(turned_scene, flats)
+        assert np.isfinite(said)
+        small = turned_scene.changed(subsamples=1)
+        for part in range(len(seen.parts)):
+            span = small.part_slice(part)
+            if span.start == span.stop:
+                continue
+            shown = image.reshape(-1, 3)[small.pixels[span]].mean()
+            every = np.arange(span.start, span.stop)
+            images = Operator(small, GRID, 0.3).images(every, flats[part])
+            true = np.einsum("pcc->pc", images).mean()
+            assert 0.3 < shown / true < 3.0
+
+
 def test_mirrors_are_shown():
     seen = scene(ground=False)
     black = np.zeros((GRID.size, 3), np.float32)

@@ -158,8 +158,9 @@ class Glances:
             mine = np.flatnonzero(parts[small.pixel_part[nodes.at]])
             if not len(mine):
                 continue
-            order = np.searchsorted(mine, known[mine])  # neighbours are of the same part
-            found = Regression.of(columns[nodes.at[mine]], order, weights[mine])
+            own = np.isin(known[mine], mine)
+            order = np.where(own, np.searchsorted(mine, known[mine]), 0)
+            found = Regression.of(columns[nodes.at[mine]], order, weights[mine] * own)
             slopes = found.slopes(shown[mine])
             shown[mine] -= np.einsum("ncd,cd->nc", columns[nodes.at[mine]], slopes)
             every = np.flatnonzero(parts[small.pixel_part])
@@ -208,6 +209,11 @@ class Glances:
             kept, error = _carried(last, known, small)
         at = self._chosen(places, kept, error, _FIRST if first else 1.0 - _NEW)
         near, weights = kriging(places, at, np.arange(len(places)), NEIGHBOURS, loose=0.5)
+        # a part with few nodes has neighbours elsewhere, perhaps of another material
+        other = small.pixel_part[at[near]] != small.pixel_part[:, None]
+        mixed = other.any(axis=1)
+        weights[mixed] = np.where(other[mixed], 0.0, np.maximum(weights[mixed], 1e-3))
+        weights[mixed] /= weights[mixed].sum(axis=1, keepdims=True)
         self._places = places
         self._nodes = _Nodes(at, near.astype(np.int32), weights, np.zeros(len(at)))
         return places, self._nodes
@@ -228,10 +234,18 @@ class Glances:
             away, near = cKDTree(places[kept]).query(places[some], 1)
             score = (error[near] + _EVEN * error.mean() + 1e-9) * away + 1e-12
         fresh = min(wanted - len(kept), len(some))
-        if fresh <= 0:
-            return kept
-        chosen = self._rng.choice(some, fresh, replace=False, p=score / score.sum())
-        return np.concatenate([kept, chosen])
+        if fresh > 0:
+            chosen = self._rng.choice(some, fresh, replace=False, p=score / score.sum())
+            kept = np.concatenate([kept, chosen])
+        # a small part without nodes would show the material of another
+        part = places[:, -1]
+        for one in np.unique(part):
+            lacking = NEIGHBOURS + 1 - int((part[kept] == one).sum())
+            if lacking > 0:
+                free = np.setdiff1d(np.flatnonzero(part == one), kept)
+                few = self._rng.choice(free, min(len(free), lacking), replace=False)
+                kept = np.concatenate([kept, few])
+        return kept
 
 
 def _behind(small: Scene) -> Float32:
