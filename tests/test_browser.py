@@ -24,10 +24,11 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
+# pixels outside an edit are compared to the bit: so large an error leaves no part to become exact
 SCENE = (
     "scene = tb.Scene(tb.teapot(8), tb.EnvironmentMap.sky(rows=32), "
     "camera=tb.Camera.orbit(-35, 20, zoom=1.05), size=192, ground=True)\n"
-    "edit = tb.EditSession(scene, 'preview', cache=False)\n"
+    "edit = tb.EditSession(scene, 'preview', cache=False, error=1.0)\n"
     "edit.assign(list(scene.shape.parts), 'red-rubber')\n"
 )
 

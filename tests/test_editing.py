@@ -1067,6 +1067,20 @@ def test_what_fails_behind_is_raised_once(call):
     assert session.render().shape == (20, 20, 3)
 
 
+def test_a_thread_that_cannot_start_is_told(monkeypatch):
+    session = EditSession(ball_scene(12, ground=False), "preview")
+
+    def full(self):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", full)
+        with pytest.raises(RuntimeError, match="new thread"):
+            session.prepare(wait=False)
+    assert session.view.job is None
+    assert session.render().shape == (12, 12, 3)
+
+
 def test_looking_elsewhere_stops_the_old_preparation(gate):
     session = EditSession(ball_scene(ground=False), "preview", progress=gate)
     old = session.draft()[0]
@@ -1820,6 +1834,25 @@ def test_edits_go_on_while_a_part_becomes_exact(small_teapot, prepared, monkeypa
     # what became exact was the old material: the new one is shown as before
     np.testing.assert_array_equal(session.render(exact=False), after)
     assert part in session.doubtful
+
+
+def test_what_becomes_exact_can_be_cancelled(small_teapot, prepared, monkeypatch):
+    session = EditSession(small_teapot, error=1e-9, transport=prepared)
+    session.render(exact=False)
+    doubtful = session.doubtful
+    whole = type(prepared).shade_exactly
+
+    def cancelled(self, index, table, mirror=None, progress=None):
+        session.cancel()
+        return whole(self, index, table, mirror, progress)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(prepared), "shade_exactly", cancelled)
+        assert not session.improve()  # a loop over it ends
+    assert session.doubtful == doubtful
+    assert session.improve()
+    session.render(exact=False)
+    assert session.doubtful == doubtful[1:]
 
 
 def test_a_basis_learns_behind(prepared):

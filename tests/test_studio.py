@@ -348,6 +348,50 @@ def test_parts_become_exact_behind_a_hand_that_rests(session):
     assert edit.report()["exact_frames"] > 0
 
 
+def test_a_hand_that_rests_as_the_refiner_ends_is_not_forgotten(session, monkeypatch):
+    edit = session.edit
+    edit.settings = dataclasses.replace(edit.settings, error=1e-9)  # nothing meets that
+    plain, late = edit.improve, []
+
+    def improve():
+        more = plain()
+        if not more and not late:  # it has looked for the last time
+            late.append(ask(session, assign={"part": "lid", "material": "red-rubber"}, rest=True))
+        return more
+
+    monkeypatch.setattr(edit, "improve", improve)
+    ask(session, rest=True)
+    session.refiner.join(60.0)
+    assert frame(late[0])["state"]["doubtful"] == ["lid"]
+    assert frame(ask(session))["state"]["doubtful"] == []
+
+
+def test_closing_ends_what_becomes_exact(session, monkeypatch):
+    edit = session.edit
+    edit.settings = dataclasses.replace(edit.settings, error=1e-9)
+    reached, opened, ended = (threading.Event() for _ in range(3))
+
+    def endless(self, index, table, mirror=None, progress=None):
+        reached.set()
+        assert opened.wait(60.0)
+        try:
+            progress("exact images", 0.5)
+        except BaseException:
+            ended.set()
+            raise
+        raise AssertionError("nobody wants it any more")
+
+    monkeypatch.setattr(type(edit.prepare()), "shade_exactly", endless)
+    ask(session)
+    ask(session, rest=True)
+    assert reached.wait(60.0)
+    refiner = session.refiner
+    threading.Timer(0.05, opened.set).start()
+    session.close()
+    assert not refiner.is_alive() and ended.is_set()
+    assert session._trouble == ""
+
+
 def test_saving_and_opening(session, tmp_path):
     ask(session, [samples(along(session))], brush=BRUSH)
     shown = Screen().draw(ask(session, rest=True))

@@ -240,7 +240,11 @@ class Preparation:
         """Run in the background, in a thread that does not keep the interpreter from ending."""
         self.thread = threading.Thread(target=self.run, name="traitbrdf-prepare", daemon=True)
         _RUNNING.add(self)
-        self.thread.start()
+        try:
+            self.thread.start()
+        except RuntimeError as error:  # no more threads: who waits for it must not wait for ever
+            self.error = error
+            self.done.set()
 
     def run(self) -> None:
         """Prepare and publish; errors are kept in `error`."""

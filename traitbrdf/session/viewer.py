@@ -104,6 +104,7 @@ class Viewer:
         self._view = View(scene)
         self._glances: Glances | None = None
         self._decoded: dict[Material, Float32] = {}  # tables of the last draft
+        self._cancels = 0  # calls of `cancel`
         self._edited: set[str] = set()  # parts that a preparation has to serve all edits of
         if transport is not None:
             if transport.scene is not scene:
@@ -371,8 +372,10 @@ class Viewer:
         return Preparation(work, publish, self.progress, owner)
 
     def cancel(self) -> None:
-        """Cancel a running preparation, which ends soon; the session goes on as before it."""
+        """Cancel a running preparation or `improve`, which ends soon; the session goes on."""
         with self._lock:
+            self._cancels += 1
+            TURNS.wake()
             job = self._view.job
             if job is not None and not job.done.is_set():
                 self._view.job = None
@@ -548,7 +551,8 @@ class Viewer:
         Returns
         -------
         bool
-            Whether there was anything to improve; the next call may find more.
+            Whether there was anything to improve; the next call may find more. False if it was
+            cancelled.
         """
         with self._lock:
             view, transport = self._view, self._serving(self._view)
@@ -559,9 +563,11 @@ class Viewer:
                 return False
             name = self.doubtful[0]
             index, material = view.scene.parts.index(name), self.materials[name]
-            renderer, owner = self.renderer, object()
+            renderer, owner, cancels = self.renderer, object(), self._cancels
 
         def outdated() -> bool:
+            if self._cancels != cancels:
+                return True
             return self._view is not view or self.materials[name] != material
 
         def told(stage: str, fraction: float) -> None:
@@ -573,7 +579,7 @@ class Viewer:
             TURNS.take(owner, False, outdated)
             found = renderer.exact(view, transport, index, material, told)
         except StoppedError:
-            return True
+            return self._cancels == cancels
         finally:
             TURNS.give(owner)
         with self._lock:

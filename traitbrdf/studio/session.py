@@ -140,6 +140,7 @@ class Session:
         self._closed = False
         self._fraction = 0.0
         self._trouble = ""
+        self._asked = False  # whether the refiner was asked for while it ran
 
     # -- transports -----------------------------------------------------------------------------
 
@@ -193,8 +194,9 @@ class Session:
             if self._telling is not None:
                 self._telling.cancel()
         self.edit.cancel()
-        if self.refiner is not None:
-            self.refiner.join(10.0)
+        refiner = self.refiner  # it may end meanwhile, and says so by None
+        if refiner is not None:
+            refiner.join(10.0)
 
     def still(self) -> bytes:
         """Return the present frame as PNG; a draft if the view is not prepared."""
@@ -536,7 +538,10 @@ class Session:
 
     def _refine(self) -> None:
         """Prepare the view in the background, and tell subscribers of its progress."""
-        if self._closed or (self.refiner is not None and self.refiner.is_alive()):
+        if self._closed:
+            return
+        if self.refiner is not None and self.refiner.is_alive():
+            self._asked = True  # it may have looked for the last time
             return
         self._trouble = ""
         self._fraction = 0.0
@@ -563,13 +568,16 @@ class Session:
                 self._tell("")
                 return
             try:
-                while self.edit is edit and not (self._closed or self._dragging) and edit.improve():
+                while self.edit is edit and not (self._closed or self._dragging):
+                    self._asked = False
+                    if not edit.improve():
+                        break
                     self._tell("")
             except Exception as error:
                 self._trouble = f"{error}"[:500]
                 self._tell("")
             with self._lock:
-                if self.edit is edit and (edit.ready or self._closed):
+                if self._closed or (self.edit is edit and edit.ready and not self._asked):
                     self.refiner = None
                     return
 
