@@ -16,7 +16,7 @@ from traitbrdf.reflectance.models import GGX, Lambert, PerfectMirror
 from traitbrdf.session.cache import Cache
 from traitbrdf.session.editing import EditSession
 from traitbrdf.session.preparation import universal_basis
-from traitbrdf.transport.interpolation import kriging_weights
+from traitbrdf.transport.interpolation import interpolate_nodes, kriging, kriging_weights
 from traitbrdf.transport.nodes import NEIGHBOURS, NodeTransport
 from traitbrdf.transport.operator import Operator
 from traitbrdf.transport.universal import UniversalBasis, light
@@ -114,6 +114,25 @@ def test_kriging_keeps_constants_and_known_places(seed, count):
     np.testing.assert_allclose(weights[:3, 1:], 0.0, atol=1e-4)
 
 
+def test_what_is_interpolated_stays_within_the_nodes_around():
+    """At the edge of a shadow, where weights below 0 would make it darker than black."""
+    line = np.arange(8, dtype=np.float32)
+    places = np.stack([line, 0.0 * line], axis=1)
+    at = np.stack([np.linspace(0.0, 7.0, 60), np.full(60, 0.2)], axis=1).astype(np.float32)
+    shown = np.repeat((line > 3.5)[:, None], 3, axis=1).astype(np.float32)
+    every = np.concatenate([places, at])
+    near, weights = kriging(every, np.arange(8), np.arange(8, 68), 4)
+    plain = np.einsum("pk,pkc->pc", weights, shown[near])
+    assert plain.min() < -0.01 and plain.max() > 1.01
+    out = np.empty((60, 3), np.float32)
+    columns = np.full((60, 3, 1), 0.5, np.float32)
+    slopes = np.array([[0.0], [2.0], [-4.0]], np.float32)
+    interpolate_nodes(out, shown, near.astype(np.int32), weights, columns, slopes)
+    np.testing.assert_allclose(out[:, 0], plain[:, 0].clip(0.0, 1.0), atol=1e-6)
+    np.testing.assert_allclose(out[:, 1], out[:, 0] + 1.0, atol=1e-6)  # beside reflections
+    np.testing.assert_array_equal(out[:, 2], 0.0)  # never negative
+
+
 # -- frames -----------------------------------------------------------------------------------
 
 
@@ -176,8 +195,9 @@ def test_frames_are_linear_in_tables_and_parts_are_apart(nodes):
     clear = (lit[0] > 0.01) & (lit[1] > 0.01) & single
     expected = lit[0] + 2.0 * lit[1]
     # but for where the sum over nodes would overshoot what they show
-    off = np.abs(lit[2] - expected)[clear] / expected[clear]
-    assert np.median(off) < 1e-5 and off.mean() < 0.01
+    off = np.abs(lit[2] - expected)[clear]
+    within = off <= 1e-3 + 1e-3 * expected[clear]
+    assert within.mean() > 0.95 and (off / expected[clear]).mean() < 2e-3
     body = seen.parts.index("body")
     mixed = nodes.frame([other if part == body else one for part in range(parts)]).image
     inside = np.zeros(48 * 48, bool)

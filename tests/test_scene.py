@@ -1028,3 +1028,31 @@ def test_primary_rays_wait_until_they_are_needed():
         _ = scene.colour
     again = pickle.loads(pickle.dumps(Scene(sphere(), SKY, size=8)))  # noqa: S301
     np.testing.assert_array_equal(again.pixels, Scene(sphere(), SKY, size=8).pixels)
+
+
+@few
+@given(cameras, st.integers(0, 10**6))
+def test_projection_is_the_way_back(camera, seed):
+    rng = np.random.default_rng(seed)
+    shape, size = sphere(0.7, (3.0, 1.0, 0.0)), (30, 50)
+    x, y = rng.uniform(0.0, 50.0, 20), rng.uniform(0.0, 30.0, 20)
+    origin = camera.position(shape, *size)
+    away = rng.uniform(0.1, 50.0, (20, 1))
+    found = camera.project(shape, *size, origin + away * camera.through(*size, x, y))
+    np.testing.assert_allclose(found, np.stack([x, y], axis=1), atol=1e-6)
+    behind = camera.project(shape, *size, origin - away * camera.through(*size, x, y))
+    assert np.isnan(behind).all()
+
+
+def test_rays_of_several_threads_are_those_of_one(monkeypatch):
+    scenes = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        scene = Scene(teapot(8), SKY, size=150, ground=True)
+        rng = np.random.default_rng(0)
+        at = rng.integers(0, len(scene.normals), 20_000)
+        seen = scene.visible(at, unit(rng.normal(size=(20_000, 3))))
+        scenes.append((scene.part_image, scene.positions, scene.normals, scene.weights, seen))
+        assert scene.rays_cast == 20_000
+    for one, other in zip(*scenes, strict=True):
+        np.testing.assert_array_equal(one, other)

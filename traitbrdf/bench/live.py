@@ -26,7 +26,6 @@ from traitbrdf.bench.trade import bandwidth
 from traitbrdf.bench.transport import bench_scene
 from traitbrdf.formats.files import atomic_path
 from traitbrdf.scene.camera import Camera
-from traitbrdf.scene.scene import Scene
 from traitbrdf.session.cache import CACHE_BYTES, Cache
 from traitbrdf.session.editing import EditSession
 from traitbrdf.session.preparation import NODES, trained_members, universal_basis
@@ -162,7 +161,7 @@ def _drags(chosen: list[Any], size: int, say: Say) -> Iterator[Record]:
 def _drag_error(session: EditSession, image: Any, size: int, tree: Any) -> float:
     """Return the mean relative L1 of a glance at fragments that its pixels show alone."""
     scene, embedding = session.scene, session.embedding
-    small = Scene.changed(scene, size=size, subsamples=1)
+    small = scene.changed(size=size, subsamples=1)
     some = np.sort(np.random.default_rng(1).choice(len(small.pixels), 200, replace=False))
     operator = Operator(small, embedding.grid_, 1.0, tree)
     true = np.empty((len(some), 3))
@@ -282,16 +281,27 @@ def _finished(session: EditSession, materials: list[NDArray[np.float64]]) -> _St
     session.prepare()
     # the edits of the stages before took time from the preparation, which goes on behind
     seconds = session.view.times["prepare"]
-    stage = _Stage(0, seconds, [], [], [])
+    return _shown(
+        session, materials, _Stage(0, seconds, [], [], []),
+        lambda: (session.render(exact=False), session.frame_error or 0.0),
+    )  # fmt: skip
+
+
+def _shown(
+    session: EditSession,
+    materials: list[NDArray[np.float64]],
+    stage: _Stage,
+    draw: Callable[[], tuple[NDArray[np.float32], float]],
+) -> _Stage:
+    """Edit the shape to each material; add to a stage what is shown, its error and the time."""
     places = _pixels(session)[1]
-    parts = session.scene.shape.parts
     for material in materials:
         begun = time.perf_counter()
-        session.assign(parts, material)
-        image = session.render(exact=False)
+        session.assign(session.scene.shape.parts, material)
+        image, stated = draw()
         stage.edits.append(time.perf_counter() - begun)
         stage.frames.append(image.reshape(-1, 3)[places])
-        stage.stated.append(session.frame_error or 0.0)
+        stage.stated.append(stated)
         session.undo()
     return stage
 
@@ -314,16 +324,7 @@ def _follow(
         nodes = session.view.nodes
         session.draft()
         stage = _Stage(len(nodes.nodes), time.perf_counter() - start, [], [], [])
-        places = _pixels(session)[1]
-        for material in materials:
-            begun = time.perf_counter()
-            session.assign(parts, material)
-            image, stated = session.draft()
-            stage.edits.append(time.perf_counter() - begun)
-            stage.frames.append(image.reshape(-1, 3)[places])
-            stage.stated.append(stated)
-            session.undo()
-        stages.append(stage)
+        stages.append(_shown(session, materials, stage, session.draft))
     session.assign(parts, materials[0])
     begun = time.perf_counter()
     session.draft(128)  # loads the small scene

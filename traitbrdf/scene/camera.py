@@ -118,9 +118,7 @@ class Camera:
         x, y : (...) arrays
             Positions in pixels from the top left corner; they broadcast.
         """
-        a = math.radians(self.azimuth)
-        right = np.array([math.cos(a), 0.0, -math.sin(a)])
-        up = np.cross(self._back, right)
+        right, up = self._across
         pixel = 2.0 * self._slope / height
         across, upwards = (x - width / 2) * pixel, (height / 2 - y) * pixel
         ray: Float64 = across[..., None] * right + upwards[..., None] * up - self._back
@@ -139,9 +137,7 @@ class Camera:
         points : (..., 3) array
             Points behind the camera have no position: theirs are NaN.
         """
-        a = math.radians(self.azimuth)
-        right = np.array([math.cos(a), 0.0, -math.sin(a)])
-        up = np.cross(self._back, right)
+        right, up = self._across
         offset = points - self.position(shape, height, width)
         depth = -(offset @ self._back)
         scale = height / (2.0 * self._slope) / np.where(depth > 0.0, depth, np.nan)
@@ -153,6 +149,13 @@ class Camera:
     def _slope(self) -> float:
         """Tangent of half the vertical field of view."""
         return math.tan(math.radians(self.fov) / 2)
+
+    @property
+    def _across(self) -> tuple[Float64, Float64]:
+        """Unit directions (3,) to the right and upwards in the image."""
+        a = math.radians(self.azimuth)
+        right = np.array([math.cos(a), 0.0, -math.sin(a)])
+        return right, np.cross(self._back, right)
 
     @property
     def _back(self) -> Float64:

@@ -55,7 +55,7 @@ DRAFT_SIZE = 128
 UNIVERSAL = ("preview", "interactive")
 """Qualities whose bases are made of the universal tables; others combine tables for each scene."""
 
-_UNIVERSAL = ("tables", "projection", "need", "typical")
+_KEPT = ("tables", "projection", "need", "typical")
 """What is kept of a universal basis."""
 
 _CALIBRATED = 96
@@ -528,7 +528,7 @@ def universal_basis(
         key = universal_key(library, seed)
         arrays = cache.read(key) or {}
         with contextlib.suppress(KeyError):  # missing, or written by something else
-            return UniversalBasis(grid, *(arrays[name] for name in _UNIVERSAL))
+            return UniversalBasis(grid, *(arrays[name] for name in _KEPT))
     report("universal basis", 0.0)
     training = training_of(library, seed)
     known = [basis for made_of, basis in _FITTED if made_of is training]
@@ -536,7 +536,7 @@ def universal_basis(
         known = [UniversalBasis.fit(grid, training, seed=seed, progress=report)]
         _FITTED[:] = [(training, known[0])]
     if cache is not None:
-        cache.write_behind(key, {name: getattr(known[0], name) for name in _UNIVERSAL})
+        cache.write_behind(key, {name: getattr(known[0], name) for name in _KEPT})
     return known[0]
 
 

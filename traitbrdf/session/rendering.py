@@ -123,10 +123,7 @@ class Renderer:
         if material not in tables:
             values = material.values(self.embedding, transport.cells)
             tables[material] = torch.from_numpy(values).to(self.settings.place)
-        mirror = None
-        if material.mirror.any():
-            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
-        frame = transport.shade(index, tables[material], mirror, alone)
+        frame = transport.shade(index, tables[material], self._mirror(material), alone)
         tier: Literal["basis", "trained", "exact"] = "basis"
         part = transport.parts[index]
         if part is not None and part.group in view.budget:
@@ -137,6 +134,12 @@ class Renderer:
         shown = Shown(frame, tier, time.perf_counter() - start)
         view.keep(index, material, shown)
         return shown
+
+    def _mirror(self, material: Material) -> torch.Tensor | None:
+        """Return a material's weight (3,) of a perfect mirror; None where it has none."""
+        if not material.mirror.any():
+            return None
+        return torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
 
     def allowed(self, view: View, index: int, floor: float | None = None) -> float:
         """Return the measured error up to which a part is shown by the basis.
@@ -202,8 +205,8 @@ class Renderer:
             met = trained.shade(index, table).error <= allowed
             # every image makes all frames slower: take few that do not help
             budget -= 1 if met else TRAINED_IMAGES // 2
-        if material.mirror.any() and part is not None:
-            mirror = torch.from_numpy(material.mirror.astype(np.float32)).to(self.settings.place)
+        mirror = self._mirror(material)
+        if mirror is not None and part is not None:
             frame = replace(frame, radiance=frame.radiance + mirror * part.mirror)
         return Exact(frame, floor, trained, budget, known)
 

@@ -57,6 +57,7 @@ from traitbrdf.transport.transport import Transport
 from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 _TICK = 0.2  # seconds between two images of `frames` while a scene is prepared
 
@@ -405,8 +406,7 @@ class Viewer:
             If `size` is no positive integer.
         """
         wanted = DRAFT_SIZE if size is None else size
-        if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
-            raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
+        _check_pixels(wanted)
         while True:
             with self._lock:
                 view = self._view
@@ -446,8 +446,7 @@ class Viewer:
         ValueError
             If `size` is no positive integer.
         """
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise ValueError(f"size: expected a positive number of pixels, got {size!r}")
+        _check_pixels(size)
         while True:
             with self._lock:
                 view = self._view
@@ -456,28 +455,25 @@ class Viewer:
             with TURNS.urgent():
                 if self._glances is None or self._glances.size != size:
                     self._glances = Glances(self.embedding.grid_, size, self.settings.seed)
-                known = self._decoded
-                tables = {
-                    m: known[m] if m in known else m.values(self.embedding) for m in materials
-                }
-                self._decoded = tables
-                frame = self._glances.frame(
-                    view.scene, [tables[m] for m in materials], [m.mirror for m in materials],
-                    self._trees.of(view.scene.environment),
-                )  # fmt: skip
+                tree = self._trees.of(view.scene.environment)
+                frame = self._glances.frame(view.scene, *self._tables(materials), tree)
             view.times["glance"] = time.perf_counter() - start
             if view is self._view:  # else it is a picture of what was looked at before
                 image = enlarged(frame.image, view.scene.height, view.scene.width)
                 return image, frame.error
 
+    def _tables(self, materials: Sequence[Material]) -> tuple[list[Float32], list[Float64]]:
+        """Return each material's table (cells, 3), decoded once, and weight (3,) of a mirror."""
+        known = self._decoded
+        tables = {m: known[m] if m in known else m.values(self.embedding) for m in materials}
+        self._decoded = tables
+        return [tables[m] for m in materials], [m.mirror for m in materials]
+
     def _at_nodes(
         self, view: View, nodes: NodeTransport, materials: tuple[Material, ...]
     ) -> Drafted:
         start = time.perf_counter()
-        known = self._decoded
-        tables = {m: known[m] if m in known else m.values(self.embedding) for m in materials}
-        self._decoded = tables
-        frame = nodes.frame([tables[m] for m in materials], [m.mirror for m in materials])
+        frame = nodes.frame(*self._tables(materials))
         view.times["draft"] = time.perf_counter() - start
         return Drafted(-len(nodes.nodes), materials, *frame)
 
@@ -487,10 +483,7 @@ class Viewer:
             tree = self._trees.of(view.scene.environment)
             grid = self.embedding.grid_
             view.draft = size, Draft(view.scene, grid, size, tree=tree, seed=self.settings.seed)
-        tables = {m: m.values(self.embedding) for m in materials}
-        image, error = view.draft[1].render(
-            [tables[m] for m in materials], [m.mirror for m in materials]
-        )
+        image, error = view.draft[1].render(*self._tables(materials))
         view.times["draft"] = time.perf_counter() - start
         return Drafted(size, materials, image, error)
 
@@ -736,3 +729,9 @@ class Viewer:
         """
         index = None if part is None else self.part(part)
         return angles_seen(self.scene, self.embedding.grid_, index)
+
+
+def _check_pixels(size: object) -> None:
+    """Raise ValueError unless a size is a positive number of pixels."""
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        raise ValueError(f"size: expected a positive number of pixels, got {size!r}")

@@ -131,6 +131,9 @@ class Glances:
         mirrors: Sequence[Float64] | None,
         tree: LightTree | None,
     ) -> NodeFrame:
+        # the distinct tables, and which parts are made of each
+        distinct = {id(table): table for table in tables}.values()
+        made_of = [(one, np.array([table is one for table in tables])) for one in distinct]
         small = self._small(scene)
         count = len(small.pixels)  # casts the camera's rays
         with ThreadPoolExecutor(1, "traitbrdf-glance") as pool:
@@ -143,8 +146,7 @@ class Glances:
             probes = np.sort(self._rng.choice(count, min(PROBES[0], count), replace=False))
             finer = Operator(small, self.grid, PROBES[1], operator.tree)
             exact = np.zeros((len(probes), 3), np.float32)
-            for one in {id(table): table for table in tables}.values():
-                parts = np.array([table is one for table in tables])
+            for one, parts in made_of:
                 for at, out, by in ((nodes.at, shown, operator), (probes, exact, finer)):
                     mine = np.flatnonzero(parts[small.pixel_part[at]])
                     if len(mine):
@@ -153,8 +155,7 @@ class Glances:
             columns, picture = looked_up.result(), behind.result()
         known, weights = kriging(places, nodes.at, nodes.at, NEIGHBOURS, leave_out=True)
         radiance = np.zeros((count, 3), np.float32)
-        for one in {id(table): table for table in tables}.values():
-            parts = np.array([table is one for table in tables])
+        for _, parts in made_of:
             mine = np.flatnonzero(parts[small.pixel_part[nodes.at]])
             if not len(mine):
                 continue

@@ -3,7 +3,8 @@
 `Transport` fits a basis to its scene, which takes half a minute. `NodeTransport` takes a basis that
 is fitted to no scene (`UniversalBasis`) and computes its images at few fragments, the nodes. All
 other fragments are interpolated from their neighbours in position, normal and mirror direction. A
-frame is A (B (C rho)): linear in the table, within milliseconds, after some seconds.
+frame is A (B (C rho)), within milliseconds, after some seconds. It is linear in the table, but for
+where the sum over nodes would overshoot what these show (`interpolate_nodes`).
 
 *Nodes.* Half of the first are drawn evenly. All others are drawn where the error of leaving a node
 out, times the distance to the next node, is large: at highlights, outlines of shadows and creases.
@@ -187,7 +188,6 @@ class NodeTransport:
         self,
         count: int,
         tables: Sequence[Float32],
-        resolution: float | None = None,
         progress: Progress | None = None,
     ) -> NodeTransport:
         """Return a transport with more nodes, those of this one included.
@@ -200,16 +200,11 @@ class NodeTransport:
             Number of nodes.
         tables : sequence of (cells, 3) float32, one for each part
             What the parts are made of at present.
-        resolution : float or None
-            As for `Operator`; all images are computed anew if it is another one.
         progress : called with (stage, fraction done); may raise to cancel
         """
         report = progress or (lambda stage, fraction: None)
         other = copy.copy(self)
         other.count, other.parts = count, list(self.parts)
-        if resolution is not None and resolution != self.operator.resolution:
-            other.operator = Operator(self.scene, self.basis.grid, resolution, self.operator.tree)
-            other._compute([part.at for part in self.parts], report, anew=True)
         other._add(count, tables, report)
         other._join(report)
         return other
@@ -233,8 +228,8 @@ class NodeTransport:
         """
         scene = self.scene
         deviation = level = 0.0
-        slopes: dict[tuple[int, int], Float32] = {}
-        shown: dict[tuple[int, int], list[Float32]] = {}
+        shown: dict[tuple[int, int], tuple[list[Float32], Float32]] = {}
+        pieces = [np.zeros((0, 3), np.float32)]
         for part, table in enumerate(tables):
             span = scene.part_slice(part)
             if span.start == span.stop:
@@ -244,13 +239,15 @@ class NodeTransport:
                 group = self._groups[int(part >= len(scene.shape.parts))]
                 key = id(table), group.start
                 if key not in shown:
-                    shown[key], slopes[key] = self._at_nodes(table, group)
-                values = shown[key][part - group.start]
-                known = self._drawn[part] = self._draw(part, table, values, slopes[key])
+                    shown[key] = self._at_nodes(table, group)
+                values, slopes = shown[key]
+                known = self._draw(part, table, values[part - group.start], slopes)
+                self._drawn[part] = known
+            # another thread may draw other materials meanwhile: this frame has its own
+            pieces.append(known.radiance)
             deviation += known.deviation
             level += known.level
-        pieces = [self._drawn[part].radiance for part in sorted(self._drawn)]
-        radiance = torch.from_numpy(np.concatenate([np.zeros((0, 3), np.float32), *pieces]))
+        radiance = torch.from_numpy(np.concatenate(pieces))
         if mirrors is not None and any(np.any(m) for m in mirrors):
             if self._mirror is None:
                 self._mirror = torch.from_numpy(self.operator.mirror(np.arange(len(radiance))))
@@ -335,21 +332,21 @@ class NodeTransport:
                     fresh[part] = np.concatenate([fresh[part], more])
         self._compute(fresh, report)
 
-    def _compute(self, fresh: Sequence[Int64], report: Progress, anew: bool = False) -> None:
-        """Compute images at fragments of each part, beside the known ones or in their place."""
+    def _compute(self, fresh: Sequence[Int64], report: Progress) -> None:
+        """Compute images at further fragments of each part."""
         done, whole = 0, max(sum(map(len, fresh)), 1)
         for part, at in enumerate(fresh):
             known = self.parts[part]
             self.operator.cast(at, self._places)
-            images = [] if anew else [known.images]
+            images = [known.images]
             for some in np.array_split(at, len(at) // _AT_ONCE + 1):
                 found = self.operator.images(some, self.basis.tables, self.operator.core)
                 found /= self.scene.weights[some].astype(np.float32)[:, None, None]
                 images.append(found)
                 done += len(some)
                 report("nodes", 0.9 * done / whole)
-            nodes = at if anew else np.concatenate([known.at, at])
-            if len(nodes) > len(known.at):
+            nodes = np.concatenate([known.at, at])
+            if len(at):
                 left_out = kriging(self._places, nodes, nodes, NEIGHBOURS, leave_out=True)
                 equations = Regression.of(self._columns[nodes], *left_out)
                 known = known._replace(regression=equations, left_out=left_out)

@@ -28,7 +28,7 @@ ROWS = (256, 64, 20)
 """Rows of the maps that are looked up: the last is as blurred as a satin surface's reflection."""
 
 _RIDGE = 0.1
-"""Weight of small coefficients in the regression, relative to the mean square of a column."""
+"""Weight of small coefficients in the regression: a share of the largest column's squares."""
 
 
 def reflections(scene: Scene, levels: Sequence[torch.Tensor] | None = None) -> Float32:
@@ -89,7 +89,7 @@ def blurred(environment: EnvironmentMap) -> list[torch.Tensor]:
 class Regression(NamedTuple):
     """The normal equations by which radiance at nodes is regressed on reflections, by colour.
 
-    Those of several parts of one material add up.
+    Those of several parts add up.
 
     Attributes
     ----------
