@@ -266,7 +266,12 @@ class Scene:
 
     # -- light that reaches a sample ------------------------------------------------------------
 
-    def visible(self, index: NDArray[np.integer], directions: NDArray[np.floating[Any]]) -> Bool:
+    def visible(
+        self,
+        index: NDArray[np.integer],
+        directions: NDArray[np.floating[Any]],
+        starts: Float64 | None = None,
+    ) -> Bool:
         """Return whether light from infinitely far away reaches samples, as booleans (m,).
 
         Directions below the surface may count as visible for parts that need no rays (`casts`),
@@ -278,6 +283,8 @@ class Scene:
             Samples.
         directions : (m, 3) array
             Unit vectors towards the light.
+        starts : (m, 3) array or None
+            Where rays start, as `spread` returns them; None for the samples' own starts.
 
         Raises
         ------
@@ -295,14 +302,17 @@ class Scene:
 
         def shoot(rows: slice) -> None:
             chosen = rows if cast is None else cast[rows]
-            free[chosen] = ~self.shape.occluded(self.starts[index[chosen]], directions[chosen])
+            start = self.starts[index[chosen]] if starts is None else starts[chosen]
+            free[chosen] = ~self.shape.occluded(start, directions[chosen])
 
         count = len(index) if cast is None else len(cast)
         self.rays_cast += count
         _in_parallel(shoot, _chunks(count))
         return free
 
-    def arriving(self, light: Light, index: NDArray[np.integer]) -> tuple[Float64, Float64]:
+    def arriving(
+        self, light: Light, index: NDArray[np.integer], starts: Float64 | None = None
+    ) -> tuple[Float64, Float64]:
         """Return directions to a light and the irradiance on a surface facing it, both (m, 3).
 
         Irradiance is zero where the light is behind the surface or hidden.
@@ -312,6 +322,8 @@ class Scene:
         light : PointLight or DirectionalLight
         index : (m,) int array
             Samples.
+        starts : (m, 3) array or None
+            Where shadow rays start, as `spread` returns them; None for the samples' own starts.
         """
         index = np.asarray(index)
         toward, given = light.arriving(self.positions[index])
@@ -324,8 +336,56 @@ class Scene:
             cast = self._cast_rows(index[rows])
             rows = rows if cast is None else rows[cast]
             for some in _chunks(len(rows)):
-                lit[rows[some]] = self._unhidden(index[rows[some]], toward[rows[some]], near)
+                at = rows[some]
+                start = self.starts[index[at]] if starts is None else starts[at]
+                lit[at] = self._unhidden(start, toward[at], near)
         return toward, np.where(lit[:, None], given, 0.0)
+
+    def spread(self, index: NDArray[np.integer], count: int) -> Float64:
+        """Return starts (m, count, 3) of shadow rays, spread over the pixels of samples.
+
+        Where the pixel shows another part, they are that of the sample.
+
+        Parameters
+        ----------
+        index : (m,) int array
+            Samples, each the only one of its fragment.
+        count : int
+        """
+        index = np.asarray(index)
+        y, x = np.divmod(self.pixels[np.searchsorted(self.offsets, index, "right") - 1], self.width)
+        u, v = sample_pattern(count)
+        # another shift in each pixel, or what runs along an axis would meet the same rows in all
+        u = (u + (0.7549 * x + 0.5698 * y)[:, None]) % 1.0
+        v = (v + (0.5698 * x + 0.7549 * y)[:, None]) % 1.0
+        origin = self.camera.position(self.shape, self.height, self.width)
+        hits = self._shoot(origin, (x[:, None] + u).ravel(), (y[:, None] + v).ravel())
+        own = np.repeat(index, count)
+        same = (hits.part == self._sample_part[own])[:, None]
+        return np.where(same, hits.start, self.starts[own]).reshape(len(index), count, 3)
+
+    def reached(self, points: Float64, directions: Float64) -> Float64:
+        """Return where rays first meet the shape or the ground: (n, 3), NaN where they do not.
+
+        Parameters
+        ----------
+        points, directions : (n, 3) float64 arrays
+            Starts, and unit vectors.
+        """
+        found = np.full(points.shape, np.nan)
+
+        def shoot(rows: slice) -> None:
+            hits = self.shape.intersect(points[rows], directions[rows])
+            met = hits.part >= 0
+            found[rows][met] = hits.position[met]
+
+        _in_parallel(shoot, _chunks(len(points)))
+        if self.ground:
+            free = np.flatnonzero(np.isnan(found[:, 0]) & (directions[:, 1] < 0.0))
+            free = free[self._over_ground(points[free], directions[free])]
+            away = (self.shape.lowest - points[free, 1:2]) / directions[free, 1:2]
+            found[free] = points[free] + away * directions[free]
+        return found
 
     def _cast_rows(self, index: NDArray[np.integer]) -> Int64 | None:
         """Return which of samples (m,) need rays; None for all of them."""
@@ -336,14 +396,10 @@ class Scene:
         return np.flatnonzero(np.asarray(self.casts)[self._sample_part[index]])
 
     def _unhidden(
-        self,
-        index: NDArray[np.integer],
-        toward: Float64,
-        near: tuple[float, float, float] | None,
+        self, starts: Float64, toward: Float64, near: tuple[float, float, float] | None
     ) -> Bool:
-        """Return whether light reaches samples (n,) past the shape, in one chunk of rays."""
-        self.rays_cast += len(index)
-        starts = self.starts[index]
+        """Return whether light reaches starts (n, 3) past the shape, in one chunk of rays."""
+        self.rays_cast += len(starts)
         if near is None:
             return ~self.shape.occluded(starts, toward)
         # the ray starts off the surface, so its direction to the light differs

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import embreex.mesh_construction
 import embreex.rtcore_scene
@@ -288,6 +288,21 @@ def sphere(radius: float = 1.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Sphere:
 # ------------------------------------------------------------------------------------------ mesh
 
 
+class Edges(NamedTuple):
+    """The sides of a mesh's triangles, those that share an edge one after the other.
+
+    Attributes
+    ----------
+    face : (n,) int64 triangle of each side
+    ends : (n, 2) int64 vertices
+    starts : (edges + 1,) int64, where edges start among the sides
+    """
+
+    face: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    starts: NDArray[np.int64]
+
+
 class Mesh:
     """Triangles with smooth normals and named parts, intersected with Embree.
 
@@ -493,6 +508,19 @@ class Mesh:
     def convex(self) -> bool:
         """Whether the mesh is certainly closed and convex; False if it is too large to test."""
         return len(self.faces) <= _CONVEX_FACES and _is_convex(self._local, self.faces)
+
+    @functools.cached_property
+    def edges(self) -> Edges:
+        """The edges between triangles; vertices at one place count as one."""
+        # at rounding errors of float32, seams between smooth patches close
+        key = np.round(self._local * 2.0**21).astype(np.int64) @ np.array([1, 1 << 31, 0x9E3779B1])
+        _, place = np.unique(key, return_inverse=True)
+        ends = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+        low, high = np.sort(place[ends], axis=1).T
+        side = low * np.int64(len(place)) + high
+        order = np.argsort(side, kind="stable")
+        starts = np.flatnonzero(np.diff(side[order], prepend=-1, append=-1))
+        return Edges(order // 3, ends[order], starts)
 
     @functools.cached_property
     def _embree(self) -> embreex.rtcore_scene.EmbreeScene:

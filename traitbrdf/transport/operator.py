@@ -15,7 +15,8 @@ the node size, while the number of nodes grows with its inverse square.
 are cut down to single texels. Each node of the cut gets one shadow ray (`VisibilityCut`).
 Neighbouring pixels see nearly the same occluders, so rays are cast on a coarse lattice of pixels,
 and between lattice points only where the points around disagree. At borders, where the samples of a
-pixel lie on both sides of an edge, rays are cast for every sample. A glossy surface shows the
+pixel lie on both sides of an edge, rays are cast for every sample; near the shadows of thin things,
+they are cast from many places of every pixel (`ThinShadows`). A glossy surface shows the
 outline of an occluder near the mirror direction; leaves there cast rays of their own.
 
 *Far and near.* Images of lobes wider than `_SPLIT` vary slowly from pixel to pixel. These far
@@ -42,7 +43,7 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.directions import reflect
 from traitbrdf.reflectance.brdf import HalfDiffGrid
-from traitbrdf.scene.lights import EnvironmentMap, turn_about_y
+from traitbrdf.scene.lights import EnvironmentMap, Light, turn_about_y
 from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.arrays import (
     QuadratureSettings,
@@ -53,6 +54,7 @@ from traitbrdf.transport.arrays import (
 )
 from traitbrdf.transport.kernels import interpolate_images, one_leaf, shade_rows
 from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.thin import light_on_thin_shadows
 from traitbrdf.transport.visibility import (
     Bundles,
     Plan,
@@ -67,6 +69,7 @@ from traitbrdf.transport.visibility import (
 )
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 f32 = np.float32
 
@@ -206,6 +209,7 @@ class Operator:
             cut = VisibilityCut.build(self.tree, _CUT[0] * width, _CUT[1] * width**2)
             self.visibility = Visibility(scene, cut, self._middle)
         self._plans: dict[int, Plan] = {}
+        self._thin: dict[Light, tuple[Int64, Float64]] = {}
 
     # -- single fragments -----------------------------------------------------------------------
 
@@ -353,7 +357,11 @@ class Operator:
     def _bundles(self, index: Int64, mask_rows: NDArray[np.int32]) -> Bundles:
         """Return the samples of fragments `index`, in groups that share one walk of the tree."""
         scene = self.scene
-        sample, owner, share = scene.samples(index)
+        if self.visibility is None:
+            sample, owner, share = scene.samples(index)
+            own_row = np.full(len(sample), -1, np.int32)
+        else:
+            sample, owner, share, own_row = self.visibility.samples(index)
         count = np.bincount(owner, minlength=len(index))
         starts = np.concatenate([[0], np.cumsum(count)])
         normals, views = self._normals[sample], self._views[sample]
@@ -389,10 +397,7 @@ class Operator:
                 edge[:-1], count[sampled], normals[members], views[members],
                 scene.positions[sample[members]], mask_rows[owner[members]], _UNITED,
             )  # fmt: skip
-        own_row = np.full(len(sample), -1, np.int32)
-        if self.visibility is not None:
-            own_row = self.visibility.row_of_sample[sample]
-            united[owner[own_row >= 0]] = False
+        united[owner[own_row >= 0]] = False
         alone = group < 0
         group[alone] = found + np.arange(alone.sum())
         order = np.argsort(group, kind="stable")
@@ -515,7 +520,7 @@ class Operator:
             for i in range(0, len(index), step):
                 at = slice(i, min(i + step, len(index)))
                 sample, owner, share = scene.samples(index[at])
-                toward, irradiance = scene.arriving(light, sample)
+                toward, irradiance = self._lights_reach(light, sample)
                 leaves = np.zeros((len(sample), 13, 1), np.float32)
                 local = scene.environment.to_map(toward)
                 leaves[:, :3, 0] = local
@@ -526,6 +531,18 @@ class Operator:
                     out[at], starts, self._normals[sample], self._views[sample],
                     share.astype(np.float32), leaves, Tables(*self.grid.shape, tables),
                 )  # fmt: skip
+
+    def _lights_reach(self, light: Light, sample: Int64) -> tuple[Float64, Float64]:
+        """Return what `Scene.arriving` does, the mean over pixels that thin shadows cross."""
+        toward, irradiance = self.scene.arriving(light, sample)
+        if self.resolution >= 1.0:
+            if light not in self._thin:
+                self._thin[light] = light_on_thin_shadows(self.scene, light)
+            which, mean = self._thin[light]
+            if len(which):
+                at = np.searchsorted(which, sample).clip(max=len(which) - 1)
+                irradiance = np.where((which[at] == sample)[:, None], mean[at], irradiance)
+        return toward, irradiance
 
     # -- visibility -----------------------------------------------------------------------------
 

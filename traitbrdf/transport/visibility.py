@@ -8,6 +8,7 @@ lights by pixels). Neighbouring fragments share their visibility masks where the
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from traitbrdf.scene.lights import turn_about_y
 from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.kernels import cut_ranges, disagreement, inherit, pack_bits
 from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.thin import ThinShadows
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -308,6 +310,10 @@ class Visibility:
     row_of : (fragments,) int32 row of each fragment, -1 for none
     row_of_sample : (samples,) int32 row of each sample that has one of its own, -1 for none
     rows : int, number of rows
+    second_row : (fragments,) int32
+        Further row of each fragment that thin shadows cover partly, -1 for none.
+    second_share : (fragments,) float64
+        Share of the fragment that sees what the further row says.
     """
 
     def __init__(self, scene: Scene, cut: VisibilityCut, middle: Int64) -> None:
@@ -318,6 +324,8 @@ class Visibility:
         # a fragment at a border has samples on both sides of an edge: each has its own row
         self.row_of_sample = np.full(len(scene.normals), -1, np.int32)
         self.rows = 0
+        self.second_row = np.full(len(scene.pixels), -1, np.int32)
+        self.second_share = np.zeros(len(scene.pixels))
         self._sharp = cut.share > 0.02  # suns, which cast sharp shadows
         self._lock = threading.Lock()  # one thread casts for the next part while another shades
         self._middle = middle
@@ -412,6 +420,83 @@ class Visibility:
             self._ray(bits, chosen)
             with self._lock:
                 self.row_of_sample[chosen] = self._append(bits)
+
+    @functools.cached_property
+    def thin(self) -> ThinShadows:
+        """Where the shadows of thin things fall."""
+        return ThinShadows(
+            self.scene, np.asarray(self.toward, np.float64), self.cut.share, self.cut.neighbours
+        )
+
+    def split(self, index: Int64) -> None:
+        """Give fragments near thin shadows rows that are right for the whole of their pixels.
+
+        A fragment of one sample that sees some nodes in part gets two rows: one in which these are
+        visible, for as much of the pixel as sees them in the mean, and one in which they are
+        hidden. A fragment of several samples has a row for each.
+
+        Parameters
+        ----------
+        index : (m,) int64 fragments that have rows
+        """
+        nodes, offsets = self.thin.nodes, self.scene.offsets
+        single = index[~self.scene.bordering[index]]
+        for i in range(0, len(single), 2048):
+            some = single[i : i + 2048]
+            seen = self.thin.seen(some)
+            partly = (seen > 0.0) & (seen < 1.0)
+            cos = self.scene.normals[offsets[some]] @ self.toward[nodes].T
+            flux = np.where(partly, self.cut.share[nodes] * cos.clip(1e-6), 0.0)
+            most = (seen > 0.0).astype(np.uint8)
+            self.row_of[some] = self._replaced(self.row_of[some], nodes, most)
+            cut = np.flatnonzero(partly.any(axis=1))
+            if len(cut):
+                least = (seen[cut] == 1.0).astype(np.uint8)
+                self.second_row[some[cut]] = self._replaced(self.row_of[some[cut]], nodes, least)
+                hidden = (flux * (1.0 - seen)).sum(axis=1) / flux.sum(axis=1).clip(1e-300)
+                self.second_share[some[cut]] = hidden[cut]
+        samples, _ = expand(offsets, index[self.scene.bordering[index]])
+        samples = samples[self.row_of_sample[samples] >= 0]
+        for i in range(0, len(samples), 2048):
+            chosen = samples[i : i + 2048]
+            own = self.row_of_sample[chosen]
+            self.row_of_sample[chosen] = self._replaced(
+                own, nodes, self.thin.seen_by_samples(chosen)
+            )
+
+    def samples(self, index: Int64) -> tuple[Int64, Int64, Float64, NDArray[np.int32]]:
+        """Return the samples of fragments as `Scene.samples` does, and the row of each, or -1.
+
+        The sample of a fragment with two rows is there twice.
+
+        Parameters
+        ----------
+        index : (m,) int64 fragments
+        """
+        sample, owner, share = self.scene.samples(index)
+        row = self.row_of_sample[sample]
+        second = self.second_row[index][owner]
+        if not (second >= 0).any():
+            return sample, owner, share, row
+        again = np.repeat(np.arange(len(sample)), 1 + (second >= 0))
+        later = np.diff(again, prepend=-1) == 0
+        part = self.second_share[index][owner][again]
+        two = second[again] >= 0
+        row = np.where(later, second[again], np.where(two, self.row_of[index][owner][again],
+                                                      row[again]))  # fmt: skip
+        share = share[again] * np.where(later, part, np.where(two, 1.0 - part, 1.0))
+        return sample[again], owner[again], share, row.astype(np.int32)
+
+    def _replaced(
+        self, rows: NDArray[np.int32], nodes: Int64, seen: NDArray[np.uint8]
+    ) -> NDArray[np.int32]:
+        """Return new rows (m,) with other bits (m, N) of some nodes above the horizon."""
+        packed = self._bits[rows]
+        bits = (packed[:, :, None] >> np.arange(0, 8, 2, dtype=np.uint8)) & np.uint8(3)
+        bits = np.ascontiguousarray(bits.reshape(len(rows), -1)[:, : len(self.cut.share)])
+        bits[:, nodes] = np.where(bits[:, nodes] < 2, seen, bits[:, nodes])
+        with self._lock:
+            return self._append(bits).astype(np.int32)
 
     def _append(self, bits: NDArray[np.uint8]) -> Int64:
         """Append rows of bits, and return their numbers."""
@@ -530,6 +615,9 @@ class Plan:
                 look(on, around[on], verify=True)
                 report("shadows", 0.0)
         sharp = _sharp_bits(scene, span, casts)
+        # fragments in and near the shadows of thin things are computed one by one
+        near = casts.thin.near if casts is not None and loose == 1.0 else None
+        thin = np.zeros(count, bool) if near is None else near[span]
         corners = np.repeat(everything[:, None], 4, axis=1)
         weights = np.zeros((count, 4))
         weights[:, 0] = 1.0
@@ -555,6 +643,7 @@ class Plan:
             ok &= _predictable(*_departure(bend, open_, found, weight), loose * scale)
             if casts is not None:
                 ok &= _shadows_agree(casts, span, normals, open_, found, sharp, loose)
+                ok &= ~(thin[open_] | (thin[found] & (found >= 0)).any(axis=1))
             good = open_[ok]
             # a missing corner has no weight: any other index will do
             some = np.take_along_axis(found, (found >= 0).argmax(axis=1)[:, None], axis=1)
@@ -569,6 +658,10 @@ class Plan:
         if casts is not None:
             for some in np.array_split(border, len(border) // 1024 + 1):
                 casts.cast_samples(some + span.start, fine)
+                report("shadows", 1.0)
+            crossed = np.flatnonzero(thin) + span.start
+            for i in range(0, len(crossed), 1024):
+                casts.split(crossed[i : i + 1024])
                 report("shadows", 1.0)
         report("shadows", 1.0)
         corners[alone] = alone[:, None]
