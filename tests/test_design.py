@@ -558,6 +558,20 @@ def test_the_history_of_any_session_replays_to_the_identical_frame(
     same(again.render(exact=False), session.render(exact=False))
 
 
+def test_a_table_that_is_assigned_twice_stays_one_table(edit, tmp_path):
+    mine, other = (
+        tb.TabulatedBRDF.from_model(GGX(r, 1.5, 0.0), EMBEDDING.grid_, "mine") for r in (0.3, 0.4)
+    )
+    for part, table in (("body", mine), ("lid", other), ("lid", mine), ("rim", mine)):
+        edit.assign(part, table)
+    edit.save(tmp_path / "design.tbr")
+    loaded = EditSession.load(tmp_path / "design.tbr", cache=False)
+    assert loaded.history == edit.history
+    assert list(loaded.design.tables()) == ["mine", "mine (2)"]
+    loaded.save(tmp_path / "again.tbr")
+    assert EditSession.load(tmp_path / "again.tbr", cache=False).history == edit.history
+
+
 def test_the_history_replays_to_the_identical_frame(edit, fresh):
     edit.assign("body", "blue-plastic")
     edit.assign(["lid", "rim"], "gold-satin")

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.design.document import Design, Document, Recorded
-from traitbrdf.design.effects import KINDS, MODELS, Applied, Palette
+from traitbrdf.design.effects import KINDS, MODELS, Applied, Assign, Palette
 from traitbrdf.design.layers import Layer
 from traitbrdf.design.masks import Framing, Painted, Parts
 from traitbrdf.design.strokes import Stroke
@@ -126,6 +126,7 @@ class _Pool:
         self._points: list[NDArray[np.float64]] = []
         self._mirrors: list[NDArray[np.float64]] = []
         self._tables: dict[int, tuple[int, NDArray[Any]]] = {}
+        self._assigned: dict[int, Any] = {}
 
     def place(self, material: Material) -> int:
         """Return the index of a material among the file's."""
@@ -152,7 +153,10 @@ class _Pool:
         kind = type(value).__name__
         if _VALUES.get(kind) is type(value):
             if kind in KINDS:
-                state = value.state(self._palette)
+                state = dict(value.state(self._palette))
+                if isinstance(value, Assign) and value.table is not None:
+                    # a table that is assigned twice stays one table
+                    state["known"] = self._assigned.setdefault(id(value.table), state["known"])
             elif dataclasses.is_dataclass(value):
                 state = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             else:
@@ -277,6 +281,8 @@ class Stored:
             for i, entry in enumerate(header["materials"])
         ]
 
+        effects: dict[str, Any] = {}  # equal ones are one object, and so are their tables
+
         def value(plain: Any) -> Any:
             if isinstance(plain, list):
                 return tuple(value(one) for one in plain)
@@ -286,7 +292,10 @@ class Stored:
                 return materials[plain["material"]]
             state = {name: value(one) for name, one in plain.items() if name != "is"}
             if plain["is"] in KINDS:
-                return KINDS[plain["is"]].restored(state, palette)
+                said = json.dumps(plain)
+                if said not in effects:
+                    effects[said] = KINDS[plain["is"]].restored(state, palette)
+                return effects[said]
             return _VALUES[plain["is"]](**state)
 
         def placed(places: Mapping[str, int]) -> dict[str, Material]:

@@ -513,8 +513,8 @@ class Mesh:
     def edges(self) -> Edges:
         """The edges between triangles; vertices at one place count as one."""
         # at rounding errors of float32, seams between smooth patches close
-        key = np.round(self._local * 2.0**21).astype(np.int64) @ np.array([1, 1 << 31, 0x9E3779B1])
-        _, place = np.unique(key, return_inverse=True)
+        key = np.round(self._local * 2.0**21).astype(np.int64)
+        place = np.unique(key, axis=0, return_inverse=True)[1].ravel()
         ends = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
         low, high = np.sort(place[ends], axis=1).T
         side = low * np.int64(len(place)) + high

@@ -48,6 +48,15 @@ from their mean, and from each."""
 _UNEVEN = 0.005
 """Greatest disagreement of a cell's corners about the light that they see; see `disagreement`."""
 
+_ROWS = 2048
+"""Visibility rows that are found at a time, between two looks at the lock."""
+
+_RAY_ROWS = 128
+"""Rows whose rays are cast at a time."""
+
+_TURNED = 0.3
+"""Distance that a normal counts for where near fragments are sought, in radii of the shape."""
+
 
 @dataclass(frozen=True)
 class VisibilityCut:
@@ -364,22 +373,45 @@ class Visibility:
             Cast an eighth of the rays on which the rows around agree, and all rays of a fragment
             where one of these proves them wrong.
         """
-        normals = self.scene.normals[self._middle[index]]
-        for i in range(0, len(index), 2048):
-            some = slice(i, min(i + 2048, len(index)))
-            bits = np.empty((some.stop - some.start, len(self.cut.share)), np.uint8)
-            inherit(bits, normals[some], self.toward, self._bits, around[some], least, self._sharp)
-            if verify:
-                inherited = bits[:, ::8].copy()
-                bits[:, ::8][inherited < 2] = 3
-                self._ray(bits, self._middle[index[some]])
-                wrong = ((inherited != bits[:, ::8]) & (inherited < 2)).any(axis=1)
-                bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
-            self._ray(bits, self._middle[index[some]])
+        for i in range(0, len(index), _ROWS):
+            some = slice(i, min(i + _ROWS, len(index)))
+            bits = self._found(self._middle[index[some]], around[some], least, verify)
             with self._lock:
                 self.row_of[index[some]] = self._append(bits)
 
-    def cast_samples(self, index: Int64, fine: bool) -> None:
+    def around(self, index: Int64) -> Callable[[Int64], NDArray[np.int32]]:
+        """Return a function of samples (m,) that returns rows (m, 4) of fragments near each.
+
+        Parameters
+        ----------
+        index : (n,) int64
+            Fragments; those that have rows can be near.
+        """
+        known = index[self.row_of[index] >= 0]
+        scene, middle = self.scene, self._middle[known]
+
+        def places(samples: Int64) -> Float64:
+            apart = scene.positions[samples] / scene.shape.radius
+            return np.concatenate([apart, _TURNED * scene.normals[samples]], axis=1)
+
+        tree = cKDTree(places(middle))
+
+        def near(samples: Int64) -> NDArray[np.int32]:
+            found = np.full((len(samples), 4), -1, np.int32)
+            nearest = min(4, len(known))
+            if nearest:
+                _, at = tree.query(places(samples), range(1, nearest + 1), workers=-1)
+                found[:, :nearest] = self.row_of[known[at]]
+            return found
+
+        return near
+
+    def cast_samples(
+        self,
+        index: Int64,
+        fine: bool,
+        near: Callable[[Int64], NDArray[np.int32]] | None = None,
+    ) -> None:
         """Find the bits of every sample of fragments that have several samples.
 
         Parameters
@@ -388,6 +420,9 @@ class Visibility:
         fine : bool
             Cast rays for every sample. If False, a sample between the first, the middle and the
             last takes the bits on which these three agree.
+        near : callable or None
+            What `around` returns: the first and the last sample of a fragment take the bits on
+            which the fragments near agree. None casts all of their rays.
         """
         offsets = self.scene.offsets
         count = np.diff(offsets)[index]
@@ -398,28 +433,42 @@ class Visibility:
         ends = np.stack([offsets[index], offsets[index + 1] - 1], axis=1)
         nothing = np.full((len(ends), 4), -1, np.int32)
         for side in (0, 1):
-            self._cast_samples(ends[:, side], nothing)
+            known = nothing if near is None else near(ends[:, side])
+            self._cast_samples(ends[:, side], known, 4, verify=True)
         around = nothing
         if not fine:
             around[:, 0] = self.row_of[index]
             around[:, 1:3] = self.row_of_sample[ends]
         samples, starts = expand(offsets, index)
-        self._cast_samples(samples, np.repeat(around, np.diff(starts), axis=0))
+        self._cast_samples(samples, np.repeat(around, np.diff(starts), axis=0), 3)
 
-    def _cast_samples(self, samples: Int64, around: NDArray[np.int32]) -> None:
-        """Find the bits of samples that have none, with rays where the rows `around` disagree."""
+    def _cast_samples(
+        self, samples: Int64, around: NDArray[np.int32], least: int, verify: bool = False
+    ) -> None:
+        """Find the bits of samples that have none; parameters as for `cast`."""
         new = self.row_of_sample[samples] < 0
         samples, around = samples[new], around[new]
-        for i in range(0, len(samples), 2048):
-            chosen = samples[i : i + 2048]
-            bits = np.empty((len(chosen), len(self.cut.share)), np.uint8)
-            inherit(
-                bits, self.scene.normals[chosen], self.toward, self._bits,
-                around[i : i + 2048], 3, self._sharp,
-            )  # fmt: skip
-            self._ray(bits, chosen)
+        for i in range(0, len(samples), _ROWS):
+            chosen = samples[i : i + _ROWS]
+            bits = self._found(chosen, around[i : i + _ROWS], least, verify)
             with self._lock:
                 self.row_of_sample[chosen] = self._append(bits)
+
+    def _found(
+        self, samples: Int64, around: NDArray[np.int32], least: int, verify: bool
+    ) -> NDArray[np.uint8]:
+        """Return the bits (m, D) of samples; parameters as for `cast`."""
+        bits = np.empty((len(samples), len(self.cut.share)), np.uint8)
+        normals = self.scene.normals[samples]
+        inherit(bits, normals, self.toward, self._bits, around, least, self._sharp)
+        if verify:
+            inherited = bits[:, ::8].copy()
+            bits[:, ::8][inherited < 2] = 3
+            self._ray(bits, samples)
+            wrong = ((inherited != bits[:, ::8]) & (inherited < 2)).any(axis=1)
+            bits[wrong] = np.where(bits[wrong] < 2, 3, bits[wrong])
+        self._ray(bits, samples)
+        return bits
 
     @functools.cached_property
     def thin(self) -> ThinShadows:
@@ -441,8 +490,8 @@ class Visibility:
         """
         nodes, offsets = self.thin.nodes, self.scene.offsets
         single = index[~self.scene.bordering[index]]
-        for i in range(0, len(single), 2048):
-            some = single[i : i + 2048]
+        for i in range(0, len(single), _ROWS):
+            some = single[i : i + _ROWS]
             seen = self.thin.seen(some)
             partly = (seen > 0.0) & (seen < 1.0)
             cos = self.scene.normals[offsets[some]] @ self.toward[nodes].T
@@ -457,8 +506,8 @@ class Visibility:
                 self.second_share[some[cut]] = hidden[cut]
         samples, _ = expand(offsets, index[self.scene.bordering[index]])
         samples = samples[self.row_of_sample[samples] >= 0]
-        for i in range(0, len(samples), 2048):
-            chosen = samples[i : i + 2048]
+        for i in range(0, len(samples), _ROWS):
+            chosen = samples[i : i + _ROWS]
             own = self.row_of_sample[chosen]
             self.row_of_sample[chosen] = self._replaced(
                 own, nodes, self.thin.seen_by_samples(chosen)
@@ -502,7 +551,10 @@ class Visibility:
         """Append rows of bits, and return their numbers."""
         need = self.rows + len(bits)
         if need > len(self._bits):
-            size = max(need, 2 * len(self._bits))  # memory that nobody writes to costs nothing
+            # one row for each fragment and for each sample at a border, unless thin shadows need
+            # more; memory that nobody writes to costs nothing, copies would
+            usual = len(self.row_of) + int((np.diff(self.scene.offsets) > 1) @ np.diff(self.scene.offsets))
+            size = max(need, usual if not len(self._bits) else 2 * len(self._bits))
             self._bits = _grown(self._bits, size)
             self._masks = tuple(_grown(a, size) for a in self._masks)
         rows = slice(self.rows, need)
@@ -513,8 +565,11 @@ class Visibility:
 
     def _ray(self, bits: NDArray[np.uint8], sample: Int64) -> None:
         """Replace the bits that are 3 by casting rays from the samples (m,)."""
-        at, node = np.nonzero(bits == 3)
-        bits[at, node] = self.scene.visible(sample[at], self.toward[node])
+        # few rows at a time: where each needs all its rays, these fill much memory
+        for i in range(0, len(bits), _RAY_ROWS):
+            some = bits[i : i + _RAY_ROWS]
+            at, node = np.nonzero(some == 3)
+            some[at, node] = self.scene.visible(sample[i + at], self.toward[node])
 
 
 def _four_to_a_byte(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -656,8 +711,9 @@ class Plan:
         alone = np.concatenate([open_, border])
         look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
         if casts is not None:
+            near_rows = casts.around(everything + span.start)
             for some in np.array_split(border, len(border) // 1024 + 1):
-                casts.cast_samples(some + span.start, fine)
+                casts.cast_samples(some + span.start, fine, near_rows)
                 report("shadows", 1.0)
             crossed = np.flatnonzero(thin) + span.start
             for i in range(0, len(crossed), 1024):
