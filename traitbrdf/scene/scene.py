@@ -261,8 +261,15 @@ class Scene:
 
     def backdrop(self) -> NDArray[np.float32]:
         """Return the frame (height, width, 3) without the object: the map behind it."""
-        _, rays = self.camera.rays(self.shape, self.height, self.width)
-        return np.asarray(self.environment.backdrop(rays), np.float32)
+        behind = np.empty((self.height, self.width, 3), np.float32)
+        x = np.arange(self.width, dtype=np.float64) + 0.5
+        band = max(1, RAYS_AT_ONCE // self.width)
+        for first in range(0, self.height, band):
+            rows = slice(first, min(first + band, self.height))
+            y = np.arange(rows.start, rows.stop)[:, None] + 0.5
+            rays = self.camera.through(self.height, self.width, x, y)
+            behind[rows] = self.environment.backdrop(rays)
+        return behind
 
     # -- light that reaches a sample ------------------------------------------------------------
 

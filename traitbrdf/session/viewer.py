@@ -366,6 +366,8 @@ class Viewer:
                     nodes = nodes.refined(count, tables, progress=report)
                 with lock:
                     view.nodes = nodes
+            if nodes is not None:
+                nodes.forget()
 
         work = functools.partial(
             prepare_view, scene, settings, palette, cache, fixed, known, begin

@@ -206,10 +206,10 @@ def damping_of(images: torch.Tensor) -> torch.Tensor:
 
     Parameters
     ----------
-    images : (C, P, R) tensor
+    images : (P, C, R) tensor
         R images of P pixels in C colours.
     """
-    size = (images**2).sum(dim=(0, 2)).sqrt()
+    size = torch.linalg.vector_norm(images, dim=(1, 2))
     usual = size.mean()
     for _ in range(8):  # a mean that the brightest pixels hardly move
         usual = size.minimum(10.0 * usual).mean()
@@ -221,17 +221,17 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
 
     Parameters
     ----------
-    images : (C, P, R) tensor
+    images : (P, C, R) tensor
     rank : int
         At most so many vectors.
     enough : float
         Vectors whose singular value is less than this share of the largest are left out.
     """
-    count, size = images.shape[0] * images.shape[2], images.shape[1]
+    size, count = len(images), images.shape[1] * images.shape[2]
     gram = torch.zeros((count, count), dtype=torch.float64)
     pieces = [slice(start, start + 8192) for start in range(0, size, 8192)]
     for piece in pieces:  # singular values span eight decades: float32 would lose four of them
-        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        columns = images[piece].reshape(-1, count).double()
         gram += columns.T @ columns
     squares, vectors = torch.linalg.eigh(gram)
     squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
@@ -239,7 +239,7 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
     turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
     basis = torch.empty((size, kept))
     for piece in pieces:
-        columns = images[:, piece].permute(1, 0, 2).reshape(-1, count).double()
+        columns = images[piece].reshape(-1, count).double()
         basis[piece] = (columns @ turn).float()
     return basis
 

@@ -209,6 +209,10 @@ class NodeTransport:
         other._join(report)
         return other
 
+    def forget(self) -> None:
+        """Give back the memory that only `refined` needs; it would find all again."""
+        self.operator.forget()
+
     @property
     def nodes(self) -> Int64:
         """Fragments at which images are computed."""

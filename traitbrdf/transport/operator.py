@@ -34,6 +34,7 @@ S. Rusinkiewicz, "A new change of variables for efficient BRDF representation", 
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -184,7 +185,7 @@ class Operator:
         environment = _divided(scene.environment)
         rows, columns, _ = environment.image.shape
         if tree is None or tuple(tree.rectangle[0]) != (0, rows, 0, columns):
-            tree = LightTree.build(environment)
+            tree = light_tree(scene.environment)
         self.tree = tree
         self._nodes = TreeArrays(*self.tree.packed, environment.image)
         scale = 1.0 / resolution
@@ -289,6 +290,12 @@ class Operator:
     def _core_of(self, tables: Float32) -> float:
         return min(self.core, core_of(self.grid, tables))
 
+    def forget(self) -> None:
+        """Give back the memory of all shadow rays; what needs them casts them again."""
+        if self.visibility is not None:
+            self.visibility = Visibility(self.scene, self.visibility.cut, self._middle)
+        self._plans = {}
+
     # -- whole parts ----------------------------------------------------------------------------
 
     def part_images(
@@ -297,6 +304,7 @@ class Operator:
         tables: Float32,
         progress: Progress | None = None,
         interpolate: bool = True,
+        out: Float32 | None = None,
     ) -> Float32:
         """Compute the radiance (P, 3, T) float32 of all fragments of a part under scalar tables.
 
@@ -310,13 +318,17 @@ class Operator:
             Interpolate shadows where rays agree, and far images where normals and shadows vary
             linearly. This is ten times faster than `images`, and resolves peaks down to the
             operator's `core` only. Tables without narrow lobes have far images alone, in any case.
+        out : (P, 3, T) float32 or None
+            Zeros, to which the radiance is added.
         """
         report = progress or (lambda stage, fraction: None)
         span = self.scene.part_slice(part)
         index = np.arange(span.start, span.stop)
         tables = np.ascontiguousarray(tables, np.float32)
+        if out is None:
+            out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
         if len(index) == 0:
-            return np.zeros((0, 3, tables.shape[1]), np.float32)
+            return out
         plan = self.plan(part, report)
         # where neighbouring pixels differ less, narrower lobes are interpolated too
         nodes = np.searchsorted(self.grid.theta_h, plan.scale * np.array(_SPLIT))
@@ -324,7 +336,6 @@ class Operator:
         lobe = lobe_of(self.grid, tables, plan.grazing)
         broad = lobe >= high  # there is no near image
         if not interpolate and not broad:
-            out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
             lobes = _Lobes(width=lobe, core=self._core_of(tables), exact=True)
             self._shade(
                 out, index, plan.mask_rows, lobes, tables,
@@ -342,7 +353,6 @@ class Operator:
             coarse, computed, self._own_rows(computed), far, wide,
             lambda fraction: report("far images", fraction),
         )  # fmt: skip
-        out = np.zeros((len(index), 3, tables.shape[1]), np.float32)
         interpolate_images(out, coarse, plan.corners, plan.weights)
         if not broad:
             self._shade(
@@ -628,8 +638,14 @@ class Operator:
 
 
 def light_tree(environment: EnvironmentMap) -> LightTree:
-    """Build the tree that an `Operator` walks, to share it between operators under one map."""
-    return LightTree.build(_divided(environment))
+    """Return the tree that an `Operator` walks; it is built once for all operators under a map."""
+    image = environment.image
+    known = _TREES.get(id(image))
+    if known is None or known.derived[_BUILT_FROM] is not image:
+        known = LightTree.build(_divided(environment))
+        known.derived[_BUILT_FROM] = image
+        _TREES[id(image)] = known
+    return known
 
 
 def _divided(environment: EnvironmentMap) -> EnvironmentMap:
@@ -692,6 +708,10 @@ def core_of(grid: HalfDiffGrid, tables: Float32) -> float:
         return CORE
     return float(np.clip(0.5 * grid.theta_h[low[0]], SHARPEST, CORE))
 
+
+_TREES: weakref.WeakValueDictionary[int, LightTree] = weakref.WeakValueDictionary()
+"""The trees in use, by the identity of their maps' images, which they keep."""
+_BUILT_FROM = ("image",)
 
 _NO_TABLES = np.zeros((1, 0), np.float32)
 _NO_NODES, _NO_WORDS = np.zeros(1, np.int32), np.zeros((1, 1), np.uint64)

@@ -424,7 +424,7 @@ class Transport:
         scene, operator = self.scene, self.operator
         fragments = self._fragments(group)
         colours = 1 if self.grey else 3
-        whole = torch.empty((colours, len(fragments), mix.shape[1]))
+        whole = np.zeros((len(fragments), 3, mix.shape[1]), np.float32)
         for part in group:
             span = scene.part_slice(part)
             casting[part].result()
@@ -433,13 +433,14 @@ class Transport:
                 done = span.start + fraction * (span.stop - span.start)
                 report(stage, done / max(len(scene.pixels), 1))
 
-            images = torch.from_numpy(operator.part_images(part, mix, told))
             at = slice(span.start - fragments.start, span.stop - fragments.start)
-            whole[:, at] = images.permute(1, 0, 2)[:colours]
-        whole *= torch.from_numpy(need).float()
-        damping = damping_of(whole)
-        basis = leading(whole.mul_(damping[:, None]), self.rank, self.ENOUGH)
-        del whole
+            operator.part_images(part, mix, told, out=whole[at])
+        images = torch.from_numpy(whole)[:, :colours]
+        images *= torch.from_numpy(need).float()
+        damping = damping_of(images)
+        images *= damping[:, None, None]
+        basis = leading(images, self.rank, self.ENOUGH)
+        del whole, images
         exact: list[Float32] = []
         for part in group:
             span = scene.part_slice(part)
@@ -533,8 +534,8 @@ class Transport:
         rows = torch.zeros((len(exact), solve.shape[0] + exact.shape[1], self.grid.size))
         rows[:, solve.shape[0] :] = torch.from_numpy(exact)
         seen = (rows != 0.0).any(dim=0).any(dim=0)
-        for i in range(0, len(chosen), 128):
-            some = slice(i, i + 128)
+        for i in range(0, len(chosen), 64):
+            some = slice(i, i + 64)
             # from the operator that made the images: the fit would amplify any difference
             shown = torch.from_numpy(self.operator.rows_as_shown(chosen[some] + fragments.start))
             for c in range(len(exact)):
@@ -543,7 +544,7 @@ class Transport:
         cells = torch.nonzero(seen)[:, 0]
         return Basis(
             parts=group,
-            basis=(basis / damping[:, None]).to(self.device),
+            basis=basis.div_(damping[:, None]).to(self.device),
             damping=damping.to(self.device),
             cells=cells.to(self.device),
             rows=rows[:, :, cells].to(self.device),
@@ -556,7 +557,8 @@ class Transport:
         count = self.FIT_FACTOR * max(basis.shape[-1], 8)
         if count >= size:
             return np.arange(size), np.ones(size)
-        leverage = (basis.double() ** 2).sum(dim=1).numpy()
+        pieces = basis.split(8192)
+        leverage = torch.cat([(piece.double() ** 2).sum(dim=1) for piece in pieces]).numpy()
         chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
         chance /= chance.sum()
         chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)

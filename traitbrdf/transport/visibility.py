@@ -54,6 +54,9 @@ _ROWS = 2048
 _RAY_ROWS = 128
 """Rows whose rays are cast at a time."""
 
+_AT_ONCE = 1 << 13
+"""Fragments whose cells are looked at together."""
+
 _TURNED = 0.3
 """Distance that a normal counts for where near fragments are sought, in radii of the shape."""
 
@@ -551,10 +554,10 @@ class Visibility:
         """Append rows of bits, and return their numbers."""
         need = self.rows + len(bits)
         if need > len(self._bits):
-            # one row for each fragment and for each sample at a border, unless thin shadows need
-            # more; memory that nobody writes to costs nothing, copies would
-            usual = len(self.row_of) + int((np.diff(self.scene.offsets) > 1) @ np.diff(self.scene.offsets))
-            size = max(need, usual if not len(self._bits) else 2 * len(self._bits))
+            # room that nobody writes to costs nothing, but copies do: at first, there is room for
+            # all fragments and for the samples of those at borders
+            count = np.diff(self.scene.offsets)
+            size = max(need, 2 * len(self._bits) or len(count) + int(count[count > 1].sum()))
             self._bits = _grown(self._bits, size)
             self._masks = tuple(_grown(a, size) for a in self._masks)
         rows = slice(self.rows, need)
@@ -806,10 +809,15 @@ def _departure(
     The first array is the distance from the interpolated value, the second the greatest distance
     from a corner.
     """
-    at = np.where(corners >= 0, corners, some[:, None])
-    around, own = bend[at], bend[some]
-    off = np.linalg.norm(np.einsum("mk,mkc->mc", weights, around) - own, axis=-1)
-    return off, np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
+    off, spread = np.empty(len(some)), np.empty(len(some))
+    for i in range(0, len(some), _AT_ONCE):
+        now = slice(i, min(i + _AT_ONCE, len(some)))
+        at = np.where(corners[now] >= 0, corners[now], some[now, None])
+        around, own = bend[at], bend[some[now]]
+        mean = np.einsum("mk,mkc->mc", weights[now], around)
+        off[now] = np.linalg.norm(mean - own, axis=-1)
+        spread[now] = np.linalg.norm(around - own[:, None], axis=-1).max(axis=1)
+    return off, spread
 
 
 def _predictable(off: Float64, spread: Float64, loose: float) -> NDArray[np.bool_]:
