@@ -767,12 +767,12 @@ def test_bad_tables(small_sphere, training, built):
 def test_a_pixel_far_above_the_subset_does_not_fill_the_basis():
     # as at grazing views, or where one pixel of thousands mirrors the sun
     generator = torch.Generator().manual_seed(4)
-    images = torch.randn(3, 2000, 16, generator=generator)
-    images[:, 1234] *= 1e5
+    images = torch.randn(2000, 3, 16, generator=generator)
+    images[1234] *= 1e5
     damping = damping_of(images)
     usual = torch.arange(2000) != 1234
     assert damping[1234] < 2e-4
     assert (damping[usual] == 1.0).all()
-    basis = leading(images * damping[:, None], 48, 1e-6)
+    basis = leading(images * damping[:, None, None], 48, 1e-6)
     torch.testing.assert_close(basis.T @ basis, torch.eye(48), rtol=0.0, atol=1e-4)
     assert (basis[1234] ** 2).sum() < 0.9

@@ -6,21 +6,25 @@ and a fixed kernel. Machines differ from day to day; ratios to these compare.
 
 from __future__ import annotations
 
+import functools
 import importlib
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from traitbrdf.bench.datasets import maps
+from traitbrdf.bench.edits import peak_memory
 from traitbrdf.bench.records import Record, Say
 from traitbrdf.bench.trade import bandwidth
 from traitbrdf.bench.transport import bench_scene
@@ -49,21 +53,51 @@ import time
 start = time.perf_counter()
 import sys
 from pathlib import Path
-from traitbrdf.bench.datasets import maps
-from traitbrdf.bench.transport import bench_scene
-from traitbrdf.session.editing import EditSession
+from traitbrdf.bench.live import first_edit
 data = Path(sys.argv[1]) if sys.argv[1] else None
-found = {name: made for name, made in maps(data, data is None)}
-light = found.get("studio") or next(iter(found.values()))
-session = EditSession(bench_scene(light, int(sys.argv[2])))
-session.prepare(wait=False)
-while session.view.nodes is None and not session.ready:
-    time.sleep(0.01)
-session.assign(session.scene.shape.parts, "red-rubber")
-session.render(wait=False, exact=False)
-print(time.perf_counter() - start)
-session.cancel()
+print(*first_edit(start, data, int(sys.argv[2]), int(sys.argv[3])))
 """
+
+
+class _First(NamedTuple):
+    """What a fresh process measured: seconds, the error of a prepared frame, and memory."""
+
+    live: float
+    prepared: float
+    error: float
+    gigabytes: float
+
+
+def first_edit(start: float, data: Path | None, height: int, width: int) -> _First:
+    """Edit a scene as soon as it is live, and prepare it.
+
+    Parameters
+    ----------
+    start : float
+        When the process began, by `time.perf_counter`.
+    data : Path or None
+    height, width : int
+        Pixels.
+    """
+    found = dict(maps(data, data is None))
+    light = found.get("studio") or next(iter(found.values()))
+    session = EditSession(bench_scene(light, (height, width)))
+    begun = time.perf_counter()
+    session.prepare(wait=False)
+    while session.view.nodes is None and not session.ready:
+        time.sleep(0.01)
+    session.assign(session.scene.shape.parts, "red-rubber")
+    session.render(wait=False, exact=False)
+    live = time.perf_counter() - start
+    session.prepare()
+    prepared = time.perf_counter() - begun
+    memory = peak_memory() or math.nan
+    used = set(trained_members(session.library))
+    others = [z for i, z in enumerate(session.library.coordinates) if i not in used]
+    materials = [others[i] for i in np.linspace(0, len(others) - 1, 8).astype(int)]
+    stage = _finished(session, materials)
+    error = float(np.median(_errors(session, stage, materials)))
+    return _First(live, prepared, error, memory)
 
 
 def live_edits(
@@ -176,14 +210,28 @@ def _drag_error(session: EditSession, image: Any, size: int, tree: Any) -> float
 
 
 def _first_scene(data: Path | None, size: int) -> Iterator[Record]:
-    """Measure the first live edit of a fresh process."""
-    command = [sys.executable, "-c", _FRESH, "" if data is None else str(data), str(size)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
-    seconds = float(done.stdout.split()[-1])
-    yield Record(
-        "first live edit of a fresh process", seconds, "s", 4.0 if size == 512 else None,
-        seconds <= 4.0 if size == 512 else None, how=f"{size}x{size}, imports included",
-    )  # fmt: skip
+    """Measure fresh processes: the first live edit, the whole preparation and its memory."""
+    full = size == 512
+    for height, width in ((size, size), (1080, 1920)) if full else ((size, size),):
+        command = [sys.executable, "-c", _FRESH, "" if data is None else str(data)]
+        command += [str(height), str(width)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=900)
+        first = _First(*(float(word) for word in done.stdout.split()[-4:]))
+        how = f"{width}x{height}, map studio or the first"
+        small = full and width == size
+        yield Record(
+            "first live edit of a fresh process", first.live, "s", 4.0 if small else None,
+            first.live <= 4.0 if small else None, how=f"{how}, imports included",
+        )  # fmt: skip
+        yield Record(
+            "a fresh process prepares", first.prepared, "s", error=first.error,
+            how=f"{how}, 8 unseen materials",
+        )  # fmt: skip
+        asked = (1.0 if small else 3.0) if full else None
+        yield Record(
+            "peak memory until then", first.gigabytes, "GB", asked,
+            None if asked is None else first.gigabytes <= asked, how=how,
+        )  # fmt: skip
 
 
 def _changes(
@@ -249,6 +297,7 @@ def _changes(
                     edit <= 33.0 if full else None, error=median, how=how,
                 )  # fmt: skip
             yield Record(f"draft of an edit without nodes, {change}", before, "s", how=how)
+    yield from _by_bandwidth(session, materials)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         with atomic_path(out / "live.png") as temporary:
@@ -335,6 +384,40 @@ def _follow(
     session.undo()
     session.undo()
     return before, stages
+
+
+def _by_bandwidth(session: EditSession, materials: list[NDArray[np.float64]]) -> Iterator[Record]:
+    """Measure frames of a prepared view beside the time in which memory gives what they read."""
+    transport, parts = session.prepare(), session.scene.shape.parts
+    rate = bandwidth()
+    basis = transport.bases[0]
+    tables = [
+        torch.from_numpy(session.embedding.decode_values(z)[transport.cells]) for z in materials
+    ]
+    for name, some in (("whole object", parts), (f"one part, {parts[2]}", parts[2:3])):
+        at = [session.scene.parts.index(part) for part in some]
+        spans = [session.scene.part_slice(part) for part in at]
+        images = sum(span.stop - span.start for span in spans) * basis.basis[0].nbytes
+        bound = (images + basis.rows.nbytes) / rate
+
+        def shade(i: int, at: list[int] = at) -> None:
+            for part in at:
+                transport.shade(part, tables[i])
+
+        def edit(i: int, some: Sequence[str] = some) -> None:
+            session.move(some, shiny=0.1 if i % 2 else -0.1)
+            session.render(exact=False)
+
+        for what, call, limit in (("frame", shade, 1.5), ("move to frame", edit, None)):
+            session.assign(parts, materials[0])
+            call(1)
+            calls = [functools.partial(call, i) for i in range(len(tables))]
+            seconds = float(np.median([_seconds(one) for one in calls]))
+            yield Record(
+                f"{what} of prepared images, by what its bytes need", seconds / bound, "times",
+                limit, None if limit is None else seconds / bound <= limit,
+                how=f"{name}: {1e3 * seconds:.2f} ms, {bound * rate / 1e6:.0f} MB",
+            )  # fmt: skip
 
 
 def _pixels(session: EditSession) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -266,8 +266,8 @@ class Scene:
         band = max(1, RAYS_AT_ONCE // self.width)
         for first in range(0, self.height, band):
             rows = slice(first, min(first + band, self.height))
-            y = np.arange(rows.start, rows.stop)[:, None] + 0.5
-            rays = self.camera.through(self.height, self.width, x, y)
+            y = np.arange(rows.start, rows.stop, dtype=np.float64)[:, None] + 0.5
+            rays = self.camera.through(self.height, self.width, x, np.asarray(y, np.float64))
             behind[rows] = self.environment.backdrop(rays)
         return behind
 

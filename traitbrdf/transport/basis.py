@@ -7,7 +7,7 @@ section 3), so all frames lie in the span of the images of a training set.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -216,7 +216,9 @@ def damping_of(images: torch.Tensor) -> torch.Tensor:
     return torch.where(size > 10.0 * usual, 10.0 * usual / size.clamp_min(1e-30), 1.0)
 
 
-def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
+def leading(
+    images: torch.Tensor, rank: int, enough: float, report: Callable[[], None] = lambda: None
+) -> torch.Tensor:
     """Return the leading left singular vectors (P, r) of images, all columns together.
 
     Parameters
@@ -226,6 +228,8 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
         At most so many vectors.
     enough : float
         Vectors whose singular value is less than this share of the largest are left out.
+    report : callable
+        Is called now and then; may raise to cancel.
     """
     size, count = len(images), images.shape[1] * images.shape[2]
     gram = torch.zeros((count, count), dtype=torch.float64)
@@ -233,6 +237,7 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
     for piece in pieces:  # singular values span eight decades: float32 would lose four of them
         columns = images[piece].reshape(-1, count).double()
         gram += columns.T @ columns
+        report()
     squares, vectors = torch.linalg.eigh(gram)
     squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
     kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
@@ -241,7 +246,32 @@ def leading(images: torch.Tensor, rank: int, enough: float) -> torch.Tensor:
     for piece in pieces:
         columns = images[piece].reshape(-1, count).double()
         basis[piece] = (columns @ turn).float()
+        report()
     return basis
+
+
+def fit_rows(
+    basis: torch.Tensor, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Float64]:
+    """Draw fragments and weights of a least-squares fit, half by leverage scores and half evenly.
+
+    Parameters
+    ----------
+    basis : (P, r) tensor, nearly orthonormal
+    count : int
+        Number of draws; some fragments are drawn more than once.
+    rng : numpy.random.Generator
+    """
+    size = len(basis)
+    if count >= size:
+        return np.arange(size), np.ones(size)
+    pieces = torch.split(basis, 8192)
+    leverage = torch.cat([(piece.double() ** 2).sum(dim=1) for piece in pieces]).numpy()
+    chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
+    chance /= chance.sum()
+    chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)
+    # a fragment stands for 1 / (expected number of draws) fragments
+    return chosen, np.sqrt(times / (count * chance[chosen]))
 
 
 def extended(basis: torch.Tensor, images: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ out, times the distance to the next node, is large: at highlights, outlines of s
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -341,7 +342,8 @@ class NodeTransport:
         done, whole = 0, max(sum(map(len, fresh)), 1)
         for part, at in enumerate(fresh):
             known = self.parts[part]
-            self.operator.cast(at, self._places)
+            share = 0.9 * done / whole
+            self.operator.cast(at, self._places, functools.partial(report, "nodes", share))
             images = [known.images]
             for some in np.array_split(at, len(at) // _AT_ONCE + 1):
                 found = self.operator.images(some, self.basis.tables, self.operator.core)

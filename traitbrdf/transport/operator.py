@@ -102,6 +102,9 @@ radians."""
 _FIRST = 1000
 """Scattered fragments that cast all of their rays, before others take over what they see."""
 
+_PIECE = 1024
+"""Samples that are shaded between two reports: whoever cancels should not wait."""
+
 _UNITED = 0.007
 """How far the half vectors of the samples of a fragment may differ for one walk, in radians."""
 
@@ -483,8 +486,11 @@ class Operator:
             bundles, target = self._bundles(index[at], mask_rows[at]), out[at]
             if place is not None:
                 bundles, target = bundles.of(place[at]), out
-            self._shade_all(target, bundles, light, tables)
-            report(at.stop / len(index))
+            done, whole = 0, max(len(bundles.target), 1)
+            for some in bundles.pieces(_PIECE):
+                self._shade_all(target, some, light, tables)
+                done += len(some.target)
+                report((at.start + (at.stop - at.start) * done / whole) / len(index))
 
     def _shade_all(self, out: Float32, bundles: Bundles, light: _Light, tables: Float32) -> None:
         """Shade bundles; repeat with twice the room those that have more leaves than it holds."""
@@ -586,7 +592,12 @@ class Operator:
         casts = np.asarray(self.scene.casts)[self.scene.pixel_part[index]]
         return np.unique(index[casts & (self.visibility.row_of[index] < 0)])
 
-    def cast(self, index: Int64, places: NDArray[np.floating[Any]]) -> None:
+    def cast(
+        self,
+        index: Int64,
+        places: NDArray[np.floating[Any]],
+        report: Callable[[], None] = lambda: None,
+    ) -> None:
         """Cast the rays of scattered fragments: fewer than `images` would where places are near.
 
         A few fragments cast all rays. Of the others, twice as many each time, each takes over that
@@ -598,6 +609,8 @@ class Operator:
             Fragments, in random order, none twice.
         places : (fragments, d) float
             Where all fragments of the scene lie; near ones see the same.
+        report : callable
+            Is called now and then; may raise to cancel.
         """
         visibility = self.visibility
         if visibility is None or not len(index):
@@ -611,7 +624,7 @@ class Operator:
             if len(known) >= _FIRST:
                 _, near = cKDTree(places[known]).query(places[fresh], 4, workers=-1)
                 around = visibility.row_of[known[near]]
-            visibility.cast(fresh, around, 4, verify=True)
+            visibility.cast(fresh, around, 4, verify=True, report=report)
             visibility.cast_samples(fresh, self.resolution > 1.0)
             known = np.concatenate([known, fresh])
             done += len(fresh)

@@ -38,7 +38,7 @@ import concurrent.futures
 import copy
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,6 +54,7 @@ from traitbrdf.transport.basis import (
     Training,
     damping_of,
     extended,
+    fit_rows,
     is_grey,
     leading,
     per_colour,
@@ -65,6 +66,8 @@ from traitbrdf.transport.visibility import Progress as Progress
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+
+_PATIENCE = 0.05  # seconds of waiting for rays between two reports
 
 
 @dataclass
@@ -427,19 +430,25 @@ class Transport:
         whole = np.zeros((len(fragments), 3, mix.shape[1]), np.float32)
         for part in group:
             span = scene.part_slice(part)
-            casting[part].result()
 
             def told(stage: str, fraction: float, span: slice = span) -> None:
                 done = span.start + fraction * (span.stop - span.start)
                 report(stage, done / max(len(scene.pixels), 1))
 
+            while concurrent.futures.wait([casting[part]], _PATIENCE).not_done:
+                told("shadows", 0.0)
+            casting[part].result()
             at = slice(span.start - fragments.start, span.stop - fragments.start)
             operator.part_images(part, mix, told, out=whole[at])
         images = torch.from_numpy(whole)[:, :colours]
         images *= torch.from_numpy(need).float()
         damping = damping_of(images)
         images *= damping[:, None, None]
-        basis = leading(images, self.rank, self.ENOUGH)
+
+        def fitting() -> None:
+            report("fitting", fragments.stop / max(len(scene.pixels), 1))
+
+        basis = leading(images, self.rank, self.ENOUGH, fitting)
         del whole, images
         exact: list[Float32] = []
         for part in group:
@@ -450,6 +459,7 @@ class Transport:
             count = min(self.PROBES, size)
             probes = np.stack([np.sort(rng.permutation(size)[:count]) for _ in range(colours)])
             known = sum(len(rows[0]) for rows in exact)
+            fitting()
             exact.append(self._probe_rows(probes + span.start))
             mirror = operator.mirror(np.arange(span.start, span.stop))
             self.parts[part] = _Part(
@@ -460,7 +470,7 @@ class Transport:
                 torch.from_numpy(probes).to(self.device),
                 slice(known, known + count),
             )
-        return self._assemble(group, basis, damping, np.concatenate(exact, axis=1), rng)
+        return self._assemble(group, basis, damping, np.concatenate(exact, axis=1), rng, fitting)
 
     def _subset(self, group: range, rng: np.random.Generator) -> Int64:
         """Draw the fragments S from all parts, from small ones more than their share."""
@@ -519,10 +529,12 @@ class Transport:
         damping: torch.Tensor,
         exact: Float32,
         rng: np.random.Generator,
+        report: Callable[[], None] = lambda: None,
     ) -> Basis:
         """Fit the group's C by weighted least squares, and collect all that a frame reads."""
         fragments = self._fragments(group)
-        chosen, importance = self._fit_rows(basis, len(fragments), rng)
+        count = self.FIT_FACTOR * max(basis.shape[-1], 8)
+        chosen, importance = fit_rows(basis, count, rng)
         weight = torch.from_numpy(importance)
         at = torch.from_numpy(chosen)
         sampled = basis[at].double() * weight[:, None]
@@ -536,6 +548,7 @@ class Transport:
         seen = (rows != 0.0).any(dim=0).any(dim=0)
         for i in range(0, len(chosen), 64):
             some = slice(i, i + 64)
+            report()
             # from the operator that made the images: the fit would amplify any difference
             shown = torch.from_numpy(self.operator.rows_as_shown(chosen[some] + fragments.start))
             for c in range(len(exact)):
@@ -549,21 +562,6 @@ class Transport:
             cells=cells.to(self.device),
             rows=rows[:, :, cells].to(self.device),
         )
-
-    def _fit_rows(
-        self, basis: torch.Tensor, size: int, rng: np.random.Generator
-    ) -> tuple[Int64, Float64]:
-        """Draw fragments and weights of the fit, half by leverage scores and half evenly."""
-        count = self.FIT_FACTOR * max(basis.shape[-1], 8)
-        if count >= size:
-            return np.arange(size), np.ones(size)
-        pieces = basis.split(8192)
-        leverage = torch.cat([(piece.double() ** 2).sum(dim=1) for piece in pieces]).numpy()
-        chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
-        chance /= chance.sum()
-        chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)
-        # a fragment stands for 1 / (expected number of draws) fragments
-        return chosen, np.sqrt(times / (count * chance[chosen]))
 
     def _join_cells(self) -> None:
         """Collect the cells that any part sees; the others are neither decoded nor stored."""

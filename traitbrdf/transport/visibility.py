@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -48,11 +48,11 @@ from their mean, and from each."""
 _UNEVEN = 0.005
 """Greatest disagreement of a cell's corners about the light that they see; see `disagreement`."""
 
-_ROWS = 2048
-"""Visibility rows that are found at a time, between two looks at the lock."""
+_ROWS = 512
+"""Visibility rows that are found at a time, between two reports."""
 
-_RAY_ROWS = 128
-"""Rows whose rays are cast at a time."""
+_RAYS = 1 << 18
+"""Most rays that are cast at a time."""
 
 _AT_ONCE = 1 << 13
 """Fragments whose cells are looked at together."""
@@ -170,6 +170,13 @@ class Bundles(NamedTuple):
             spread=np.zeros(len(self.target), np.float32),
             masks=np.repeat(self.masks, size, axis=0), several=np.repeat(self.several, size),
         )  # fmt: skip
+
+    def pieces(self, samples: int) -> Iterator[Bundles]:
+        """Return bundles of about so many samples together, one piece after the other."""
+        first = self.group_start[self.bundle_start[:-1]]
+        which = np.repeat(first // samples, np.diff(self.bundle_start))
+        for piece in np.unique(which):
+            yield self.take(which == piece)
 
     def take(self, groups: NDArray[np.bool_]) -> Bundles:
         """Return the groups of a mask (G,) alone."""
@@ -361,7 +368,12 @@ class Visibility:
         return self._masks
 
     def cast(
-        self, index: Int64, around: NDArray[np.int32], least: int, verify: bool = False
+        self,
+        index: Int64,
+        around: NDArray[np.int32],
+        least: int,
+        verify: bool = False,
+        report: Callable[[], None] = lambda: None,
     ) -> None:
         """Find the bits of fragments, with rays where the rows around them disagree.
 
@@ -375,12 +387,15 @@ class Visibility:
         verify : bool
             Cast an eighth of the rays on which the rows around agree, and all rays of a fragment
             where one of these proves them wrong.
+        report : callable
+            Is called now and then; may raise to cancel.
         """
         for i in range(0, len(index), _ROWS):
             some = slice(i, min(i + _ROWS, len(index)))
             bits = self._found(self._middle[index[some]], around[some], least, verify)
             with self._lock:
                 self.row_of[index[some]] = self._append(bits)
+            report()
 
     def around(self, index: Int64) -> Callable[[Int64], NDArray[np.int32]]:
         """Return a function of samples (m,) that returns rows (m, 4) of fragments near each.
@@ -436,8 +451,8 @@ class Visibility:
         ends = np.stack([offsets[index], offsets[index + 1] - 1], axis=1)
         nothing = np.full((len(ends), 4), -1, np.int32)
         for side in (0, 1):
-            known = nothing if near is None else near(ends[:, side])
-            self._cast_samples(ends[:, side], known, 4, verify=True)
+            beside = nothing if near is None else near(ends[:, side])
+            self._cast_samples(ends[:, side], beside, 4, verify=True)
         around = nothing
         if not fine:
             around[:, 0] = self.row_of[index]
@@ -568,9 +583,10 @@ class Visibility:
 
     def _ray(self, bits: NDArray[np.uint8], sample: Int64) -> None:
         """Replace the bits that are 3 by casting rays from the samples (m,)."""
-        # few rows at a time: where each needs all its rays, these fill much memory
-        for i in range(0, len(bits), _RAY_ROWS):
-            some = bits[i : i + _RAY_ROWS]
+        # some rows at a time: where each needs all its rays, these fill much memory
+        step = max(_RAYS // max(bits.shape[1], 1), 1)
+        for i in range(0, len(bits), step):
+            some = bits[i : i + step]
             at, node = np.nonzero(some == 3)
             some[at, node] = self.scene.visible(sample[i + at], self.toward[node])
 
@@ -659,7 +675,10 @@ class Plan:
             some, around = some[new], around[new]
             if casts is not None and len(some):
                 rows = np.where(around >= 0, casts.row_of[span][around], -1).astype(np.int32)
-                casts.cast(some + span.start, rows, least, verify and loose == 1.0)
+                casts.cast(
+                    some + span.start, rows, least, verify and loose == 1.0,
+                    lambda: report("shadows", 0.0),
+                )  # fmt: skip
             known[some] = True
 
         if casts is not None:
@@ -715,12 +734,12 @@ class Plan:
         look(alone, around[alone], 2, verify=True)  # creases hold narrow shadows
         if casts is not None:
             near_rows = casts.around(everything + span.start)
-            for some in np.array_split(border, len(border) // 1024 + 1):
+            for some in np.array_split(border, len(border) // 256 + 1):
                 casts.cast_samples(some + span.start, fine, near_rows)
                 report("shadows", 1.0)
             crossed = np.flatnonzero(thin) + span.start
-            for i in range(0, len(crossed), 1024):
-                casts.split(crossed[i : i + 1024])
+            for i in range(0, len(crossed), 256):
+                casts.split(crossed[i : i + 256])
                 report("shadows", 1.0)
         report("shadows", 1.0)
         corners[alone] = alone[:, None]
