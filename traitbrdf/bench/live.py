@@ -405,7 +405,8 @@ def _by_bandwidth(session: EditSession, materials: list[NDArray[np.float64]]) ->
                 transport.shade(part, tables[i])
 
         def edit(i: int, some: Sequence[str] = some) -> None:
-            session.move(some, shiny=0.1 if i % 2 else -0.1)
+            amount = 0.1 + 0.002 * i  # never back to a frame that is still known
+            session.move(some, shiny=amount if i % 2 else -amount)
             session.render(exact=False)
 
         for what, call, limit in (("frame", shade, 1.5), ("move to frame", edit, None)):

@@ -789,7 +789,7 @@ def shade_rows(
         the capacity; such groups add nothing. Groups with questions add nothing either, unless
         the answers are final.
     questions : Questions
-    bundles : visibility.Bundles
+    bundles : bundles.Bundles
     tree : TreeArrays
     masks : VisibilityMasks
     settings : QuadratureSettings

@@ -53,21 +53,18 @@ from traitbrdf.transport.arrays import (
     TreeArrays,
     VisibilityMasks,
 )
-from traitbrdf.transport.kernels import interpolate_images, one_leaf, shade_rows
-from traitbrdf.transport.lighttree import LightTree
-from traitbrdf.transport.thin import light_on_thin_shadows
-from traitbrdf.transport.visibility import (
+from traitbrdf.transport.bundles import (
     Bundles,
-    Plan,
-    Progress,
-    Visibility,
-    VisibilityCut,
     alike_masks,
     centres,
     expand,
     first_rows,
     questions,
 )
+from traitbrdf.transport.kernels import interpolate_images, one_leaf, shade_rows
+from traitbrdf.transport.lighttree import LightTree
+from traitbrdf.transport.thin import light_on_thin_shadows
+from traitbrdf.transport.visibility import Plan, Progress, Visibility, VisibilityCut
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -292,6 +289,13 @@ class Operator:
 
     def _core_of(self, tables: Float32) -> float:
         return min(self.core, core_of(self.grid, tables))
+
+    def settle(self) -> None:
+        """Give back some memory of the shadow rays, if all parts have cast theirs."""
+        spans = [self.scene.part_slice(part) for part in range(len(self.scene.parts))]
+        cast = all(part in self._plans or s.start == s.stop for part, s in enumerate(spans))
+        if cast and self.visibility is not None:
+            self.visibility.settle()
 
     def forget(self) -> None:
         """Give back the memory of all shadow rays; what needs them casts them again."""

@@ -440,6 +440,7 @@ class Transport:
             casting[part].result()
             at = slice(span.start - fragments.start, span.stop - fragments.start)
             operator.part_images(part, mix, told, out=whole[at])
+        operator.settle()  # from here on, memory is scarce
         images = torch.from_numpy(whole)[:, :colours]
         images *= torch.from_numpy(need).float()
         damping = damping_of(images)
