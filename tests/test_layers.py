@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "traitbrdf"
 
 FLOORS = (
-    ("directions", "formats"),
+    ("compiled", "directions", "formats"),
     ("reflectance",),
     ("scene", "recipes"),
     ("transport", "reference"),

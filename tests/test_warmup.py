@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import traitbrdf as tb
+from traitbrdf.compiled import drop_outdated
 from traitbrdf.session import preparation, warmup
 from traitbrdf.session.cache import Cache
 from traitbrdf.session.editing import EditSession
@@ -144,3 +145,26 @@ def test_what_is_started_in_the_background_is_ended(
     assert [thread.daemon for thread in found] == [False, False]
     for thread in found:
         thread.join(60.0)
+
+
+def test_compiled_code_that_is_older_than_its_source_is_removed(tmp_path: Path) -> None:
+    """A function of another file may be part of it, and a class that it names may have moved."""
+    times = {
+        "reflectance/a.py": 10, "reflectance/__pycache__/a.f-1.py311.nbi": 11,
+        "space/b.py": 5, "space/c.py": 12, "space/__pycache__/b.g-1.py311.nbi": 11,
+        "transport/d.py": 1, "transport/__pycache__/d.h-1.py311.nbi": 11,
+        "transport/__pycache__/d.k-1.py311.nbi": 13, "transport/__pycache__/d.h-1.py311.1.nbc": 11,
+    }  # fmt: skip
+    for name, seconds in times.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+        os.utime(path, (seconds, seconds))
+    gone = {
+        tmp_path / "space/__pycache__/b.g-1.py311.nbi",
+        tmp_path / "transport/__pycache__/d.h-1.py311.nbi",
+    }
+    assert set(drop_outdated(tmp_path)) == gone
+    assert not any(path.exists() for path in gone)
+    assert sum(path.is_file() for path in tmp_path.rglob("*")) == len(times) - len(gone)
+    assert drop_outdated(tmp_path) == []

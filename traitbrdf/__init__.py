@@ -6,6 +6,7 @@ result is a tabulated BRDF that can be written to a file.
 
 from typing import TYPE_CHECKING, Any
 
+from traitbrdf import compiled as compiled  # first: it removes outdated compiled code
 from traitbrdf import reference as reference
 from traitbrdf.design import effects as effects
 from traitbrdf.design.effects import *  # noqa: F403  (a new effect is public at once)

@@ -1,0 +1,41 @@
+"""Compiled code on disk: what is older than its source is removed before anything loads it.
+
+Numba compares a function with its own file alone. But its code contains functions of other files as
+well, and it cannot even be read any more once a class that it names has moved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+ROOMS = ("reflectance", "space", "transport")
+"""Folders with compiled code; each may contain functions of those before it."""
+
+
+def drop_outdated(package: Path) -> list[Path]:
+    """Remove compiled code that is older than a source file that it may contain.
+
+    What cannot be removed stays.
+
+    Parameters
+    ----------
+    package : path of the folder that has `ROOMS`
+
+    Returns
+    -------
+    list of Path
+        Index files that were removed; code without its index is compiled anew.
+    """
+    newest, dropped = 0.0, []
+    for room in ROOMS:
+        newest = max([newest, *(path.stat().st_mtime for path in (package / room).glob("*.py"))])
+        for index in (package / room / "__pycache__").glob("*.nbi"):
+            with contextlib.suppress(OSError):  # gone meanwhile, or not ours to remove
+                if index.stat().st_mtime < newest:
+                    index.unlink()
+                    dropped.append(index)
+    return dropped
+
+
+drop_outdated(Path(__file__).parent)
