@@ -14,7 +14,7 @@ from sessions import on, same
 import traitbrdf as tb
 from traitbrdf.design import effects
 from traitbrdf.design.document import Design, Document
-from traitbrdf.design.effects import Applied, Assign, Effect, Move, Palette, Tint, blended
+from traitbrdf.design.effects import Applied, Assign, Effect, Move, Palette, Tint, mixed
 from traitbrdf.design.layers import Layer
 from traitbrdf.design.masks import Parts
 from traitbrdf.design.strokes import Stroke
@@ -156,6 +156,7 @@ def test_no_weight_changes_nothing(kind):
 EXAMPLES: dict[str, Effect] = {
     "Assign": Assign("chrome"),
     "Move": Move(shiny=0.4),
+    "Parameters": tb.Parameters("GGX", alpha=0.3),
     "Tint": Tint((1.0, 0.2, 0.1)),
 }
 
@@ -166,17 +167,29 @@ def test_every_effect_has_an_example():
 
 
 @given(st.floats(0.0, 1.0))
-def test_a_blend_goes_straight(weight):
+@settings(max_examples=20)
+def test_a_mixture_goes_straight(weight):
+    """Frames of a surface that is half covered are half of each; mirrors beside tables as well."""
     chrome = Material.of_reflectance(GGX(0.1, 1.5, 0.0) + PerfectMirror(0.2), EMBEDDING)
-    found = blended(PLAIN, chrome, weight)
-    np.testing.assert_allclose(found.z, (1 - weight) * PLAIN.z + weight * chrome.z, atol=1e-12)
+    found = mixed(PLAIN, chrome, weight, EMBEDDING)
     np.testing.assert_allclose(found.mirror, weight * chrome.mirror, atol=1e-12)
+    ends = [one.values(EMBEDDING).astype(np.float64) for one in (PLAIN, chrome)]
+    straight = (1.0 - weight) * ends[0] + weight * ends[1]
+    np.testing.assert_allclose(found.values(EMBEDDING), straight, rtol=2e-3, atol=2e-5)
     if weight == 1.0:
         assert found is chrome
     elif weight == 0.0:
         assert found is PLAIN
-    else:
-        np.testing.assert_allclose(found.offset, weight * chrome.offset, rtol=1e-5, atol=1e-6)
+
+
+@given(st.floats(0.0, 1e-3))
+@settings(max_examples=10)
+def test_coordinates_of_a_mixture_begin_and_end_with_those_of_its_parts(step):
+    gold = Material.of_library("gold-polished", LIBRARY)
+    span = EMBEDDING.high_ - EMBEDDING.low_
+    for share, end in ((step, PLAIN), (1.0 - step, gold)):
+        found = mixed(PLAIN, gold, share, EMBEDDING)
+        assert np.abs((found.z - end.z) / span).max() < 0.1
 
 
 members = st.integers(0, len(LIBRARY) - 1).map(
@@ -788,7 +801,7 @@ def replaced(**values):
 @pytest.mark.parametrize(
     "change",
     [
-        change_header(format=4),
+        change_header(format=5),
         change_header(format=None),
         change_header(embedding="0123456789abcdef"),
         change_header(shape={"kind": "mesh", "parts": ["one"]}),

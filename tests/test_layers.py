@@ -40,7 +40,7 @@ HOMES = {
     "embreex": {"scene/shapes.py"},
     "trimesh": {"scene/shapes.py", "scene/meshes.py"},
     "numba": {
-        "reflectance/descriptors.py", "space/highlights.py", "space/scores.py",
+        "reflectance/descriptors.py", "scene/trails.py", "space/highlights.py", "space/scores.py",
         "transport/interpolation.py", "transport/kernels.py",
     },
 }  # fmt: skip

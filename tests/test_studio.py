@@ -542,6 +542,13 @@ KEYS = st.sampled_from(
 )  # fmt: skip
 
 
+@pytest.mark.parametrize("seq", [float("inf"), float("nan"), True, "1", [1]])
+def test_a_number_that_is_none_is_not_repeated(session, seq):
+    (reply, _), *_ = session.handle({"kind": "input", "view": "a", "seq": seq})
+    assert reply["seq"] is None
+    json.dumps(reply, allow_nan=False)
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     header=JSON | st.dictionaries(KEYS, JSON).map(lambda d: {"kind": "input", **d}),
@@ -808,3 +815,76 @@ def test_the_canvas_says_what_it_needs(small_sphere, monkeypatch, capsys):
         tb.studio(tb.EditSession(small_sphere))
     assert main(["studio"]) == 1
     assert "traitbrdf[studio]" in capsys.readouterr().err
+
+
+# -- paint on the surface -----------------------------------------------------------------------
+
+SOFT = {**BRUSH, "where": "local", "radius": 6.0, "hardness": 0.3, "amount": 0.6}
+SPOT = [(24.0, 26.0), (30.0, 30.0), (36.0, 30.0)]
+
+
+def test_a_soft_stroke_grows_and_is_one_undo(session):
+    before = session.edit.render()
+    for count in (1, 2, 3):
+        piece = samples(SPOT[count - 1 : count], begin=count == 1, lift=count == 3)
+        assert not errors(ask(session, [piece], brush=SOFT))
+        assert len(session.edit.layers) == 1
+    whole = over(session.edit.prepare(), cache=False)
+    stroke = Stroke(SPOT, radius=6.0, hardness=0.3, pressure=[1.0, 1.0, 1.0])
+    whole.paint(stroke, tb.Move(shiny=0.6), only="body", where="local")
+    assert session.edit.design.layers == whole.design.layers
+    (told,) = frame(ask(session))["state"]["layers"]
+    assert told["local"]
+    assert told["opacity"] == 1.0
+    assert "shiny" in told["effect"]
+    assert frame(ask(session, do="undo"))["state"]["layers"] == []
+    np.testing.assert_array_equal(session.edit.render(), before)
+
+
+def test_paint_with_materials_colours_and_the_eraser(session):
+    ask(session, [samples(SPOT)], brush={**SOFT, "material": "gold-polished"})
+    ask(session, [samples(SPOT)], brush={**SOFT, "tint": "#ff8000"})
+    first, second = session.edit.layers
+    assert first.effect == tb.Assign("gold-polished")
+    assert second.effect == tb.Colour("#ff8000")
+    assert len(first.mask.strokes) == 1
+    ask(session, [samples(SPOT[:1])], brush={**SOFT, "onto": 0})
+    ask(session, [samples(SPOT[1:])], brush={**SOFT, "onto": 0, "erase": True})
+    assert [one.erase for one in session.edit.layers[0].mask.strokes] == [False, False, True]
+    assert len(session.edit.layers) == 2
+    for brush, message in (
+        ({"erase": True}, "choose one"), ({"tint": "red"}, "expected a colour such as"),
+        ({"onto": 7}, "index"), ({"onto": "top"}, "index of a layer"),
+        ({"hardness": 9}, "hardness"),
+        ({"material": "gold"}, "unknown"), ({"flow": 0}, "flow"),
+    ):  # fmt: skip
+        replies = ask(session, [samples(SPOT)], brush={**SOFT, **brush})
+        assert message in errors(replies)[0]
+    assert len(session.edit.layers) == 2
+
+
+def test_layers_are_changed_from_the_list(session):
+    ask(session, [samples(SPOT)], brush=SOFT)
+    ask(session, [samples(SPOT)], brush={**SOFT, "material": "gold-polished"})
+    for opacity, done in ((0.9, False), (0.6, False), (0.4, True)):
+        layer = {"index": 0, "set": {"opacity": opacity}, "done": done}
+        assert not errors(ask(session, layer=layer))
+    assert session.edit.layers[0].opacity == 0.4
+    ask(session, do="undo")
+    assert session.edit.layers[0].opacity == 1.0
+    for do, effects in (
+        ("up", ["Assign", "Move"]), ("duplicate", ["Assign", "Assign", "Move"]),
+        ("delete", ["Assign", "Move"]), ("invert", ["Assign", "Move"]),
+        ("clear", ["Assign", "Move"]),
+    ):  # fmt: skip
+        assert not errors(ask(session, layer={"index": 0, "do": do}))
+        assert [type(layer.effect).__name__ for layer in session.edit.layers] == effects
+    ask(session, layer={"index": 1, "set": {"name": "worn", "visible": False}})
+    assert session.edit.layers["worn"].visible is False
+    for layer, message in (
+        ({"index": 5, "do": "delete"}, "expected a layer"), ({"do": "delete"}, "an index"),
+        ({"index": 0, "do": "explode"}, "expected one of"), ("top", "an object"),
+        ({"index": 0, "set": {"mask": None}}, "settings among"),
+        ({"index": 0, "set": {"opacity": 7.0}}, "opacity"),
+    ):  # fmt: skip
+        assert message in errors(ask(session, layer=layer))[0]

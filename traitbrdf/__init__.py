@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 from traitbrdf import compiled as compiled  # first: it removes outdated compiled code
 from traitbrdf import reference as reference
 from traitbrdf.design import effects as effects
+from traitbrdf.design.colours import Colour as Colour
+from traitbrdf.design.colours import Highlight as Highlight
 from traitbrdf.design.effects import *  # noqa: F403  (a new effect is public at once)
+from traitbrdf.design.parameters import Parameters as Parameters
 from traitbrdf.design.strokes import Stroke as Stroke
 from traitbrdf.formats.files import FormatError as FormatError
 from traitbrdf.reflectance import models as models
@@ -64,7 +67,7 @@ __all__ = [
     "studio",
     "teapot",
 ]
-__all__ += effects.__all__
+__all__ += [*effects.__all__, "Colour", "Highlight", "Parameters"]
 
 
 def __getattr__(name: str) -> Any:

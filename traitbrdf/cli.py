@@ -137,8 +137,14 @@ def _parser() -> argparse.ArgumentParser:
     gallery.add_argument(
         "--table", action="store_true", help="one row per trait, the materials side by side"
     )
+    gallery.add_argument(
+        "--brushes", action="store_true",
+        help="instead: before and after of every brush, slider and effect, with its calls",
+    )  # fmt: skip
     gallery.add_argument("--env", type=Path, help="HDR map (.exr, .hdr); default: a sky")
-    gallery.add_argument("--size", type=_size, default=96, help="pixels per sphere (%(default)s)")
+    gallery.add_argument(
+        "--size", type=_size, help="pixels per sphere (default: 96; with --brushes 200)"
+    )
     gallery.add_argument("--out", type=Path, required=True, help="picture (.png)")
     gallery.set_defaults(run=_gallery)
 
@@ -502,6 +508,17 @@ def _angles(given: argparse.Namespace) -> int:
 
 
 def _gallery(given: argparse.Namespace) -> int:
+    environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
+    if given.brushes:
+        # imports sessions, which most commands do not need
+        from traitbrdf.session.gallery import EXAMPLES, brushes
+
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        with _Progress() as progress:
+            picture = brushes(given.size or 200, environment, progress=progress)
+        write_png(given.out, picture)
+        print(f"{given.out}: {len(EXAMPLES)} examples")
+        return 0
     # imports torch, which most commands do not need
     from traitbrdf.pictures import sheet
 
@@ -514,7 +531,6 @@ def _gallery(given: argparse.Namespace) -> int:
     held = _hold(given)
     for name in held or ():
         space.held(name)
-    environment = None if given.env is None else tb.EnvironmentMap.read(given.env)
     given.out.parent.mkdir(parents=True, exist_ok=True)  # fail before the work, not after it
     rows: dict[str, list[tb.TabulatedBRDF]] = {}
     columns = [f"{step:+.2f}" for step in steps] if traits else []
@@ -536,7 +552,7 @@ def _gallery(given: argparse.Namespace) -> int:
                     print(f"{name}: {one}")
         if not traits:
             rows.setdefault("" if given.table else name, []).append(library[name])
-    write_png(given.out, sheet(rows, columns, environment, given.size))
+    write_png(given.out, sheet(rows, columns, environment, given.size or 96))
     print(f"{given.out}: {len(rows)} rows")
     return 0
 

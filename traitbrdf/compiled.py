@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-ROOMS = ("reflectance", "space", "transport")
+ROOMS = ("reflectance", "scene", "space", "transport")
 """Folders with compiled code; each may contain functions of those before it."""
 
 

@@ -76,7 +76,7 @@ class Record:
 
 NAMES = (
     "transport", "families", "shadows", "table", "embedding", "edit", "prepare", "live", "peers",
-    "traits", "promises", "trade",
+    "traits", "local", "promises", "trade",
 )  # fmt: skip
 """Names of the benches; `traitbrdf.bench.run` maps them to functions."""
 

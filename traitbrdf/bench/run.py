@@ -12,6 +12,7 @@ from typing import TypeAlias
 from traitbrdf.bench.edits import edit_speed, preparation
 from traitbrdf.bench.embedding import embedding_error, table_error
 from traitbrdf.bench.live import live_edits
+from traitbrdf.bench.local import local_paint
 from traitbrdf.bench.records import NAMES, ON_REQUEST, Record, Say
 from traitbrdf.bench.rivals import peer_speed
 from traitbrdf.bench.trade import promises_kept, trade
@@ -26,7 +27,7 @@ BENCHES: dict[str, Bench] = dict(
         NAMES,
         (
             transport_error, family_error, shadow_error, table_error, embedding_error, edit_speed,
-            preparation, live_edits, peer_speed, trait_laws, promises_kept, trade,
+            preparation, live_edits, peer_speed, trait_laws, local_paint, promises_kept, trade,
         ),
         strict=True,
     )

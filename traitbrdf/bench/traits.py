@@ -30,7 +30,7 @@ from traitbrdf import pictures as gallery
 from traitbrdf.bench.metrics import highlight_hole
 from traitbrdf.bench.people import rated
 from traitbrdf.bench.records import Record, Say
-from traitbrdf.formats.display import exposure_of, tone_map
+from traitbrdf.formats.display import decode_srgb, exposure_of, tone_map
 from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, albedo_operator
 from traitbrdf.reflectance.descriptors import READINGS, cielab, describe_columns, hue, reading_rows
 from traitbrdf.scene.lights import EnvironmentMap
@@ -264,7 +264,7 @@ def rendered_steps(points: Float64, environment: EnvironmentMap, size: int = PIC
 
 _BYTES = np.arange(256) / 255.0
 
-_LINEAR = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
+_LINEAR = decode_srgb(_BYTES)
 """Linear values (256,) of sRGB bytes: IEC 61966-2-1."""
 
 

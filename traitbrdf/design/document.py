@@ -8,19 +8,20 @@ computed from there on.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter, OrderedDict
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from traitbrdf.design.effects import Applied, Assign, Effect, Palette, table_name
 from traitbrdf.design.layers import Layer
-from traitbrdf.design.masks import Framing
+from traitbrdf.design.masks import Framing, Local
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.reflectance.brdf import Reflectance
 from traitbrdf.space.material import Material
 
-_REMEMBERED = 256
+_REMEMBERED = 512
 """Outcomes of effects that are kept: what is undone and done again is not computed again."""
 
 
@@ -72,14 +73,20 @@ class Design:
 
     def with_layer(self, layer: Layer) -> Design:
         """Return the design with a layer on top."""
-        self.check_parts(part for part, _ in layer.mask.weights)
+        self.check_mask(layer)
         return replace(self, layers=(*self.layers, layer))
+
+    def with_layer_above(self, key: int, layer: Layer) -> Design:
+        """Return the design with a further layer right above the one of a key."""
+        i = self.place(key) + 1
+        self.check_mask(layer)
+        return replace(self, layers=(*self.layers[:i], layer, *self.layers[i:]))
 
     def with_settings(self, key: int, **settings: Any) -> Design:
         """Return the design with other settings of one layer (`Layer`'s attributes)."""
         i = self.place(key)
         changed = replace(self.layers[i], **settings)
-        self.check_parts(part for part, _ in changed.mask.weights)
+        self.check_mask(changed)
         return replace(self, layers=(*self.layers[:i], changed, *self.layers[i + 1 :]))
 
     def without(self, key: int) -> Design:
@@ -102,6 +109,13 @@ class Design:
         for name in names:
             if name not in self.materials:
                 raise ValueError(unknown_name("part", name, tuple(self.materials)))
+
+    def check_mask(self, layer: Layer) -> None:
+        """Raise ValueError if a layer's mask names parts that the design has not."""
+        mask = layer.mask
+        self.check_parts(mask.parts)
+        if isinstance(mask, Local) and mask.whole != tuple(self.materials):
+            raise ValueError(f"mask: expected one of {[*self.materials]}, got {[*mask.whole]}")
 
     def touched(self) -> set[str]:
         """Return the parts that layers may lead anywhere in the gamut."""
@@ -161,6 +175,49 @@ class Folded(NamedTuple):
     applied: Mapping[str, Applied]
 
 
+Outcome: TypeAlias = Callable[[Effect, float, Material], Applied]
+
+
+@dataclass(frozen=True, eq=False)
+class Varying:
+    """How the material of one part varies with the weights of local layers.
+
+    Attributes
+    ----------
+    part : str
+        Its name.
+    start : Material, below the lowest of the layers
+    layers : tuple of Layer
+        The lowest local layer and those above it, as far as they touch the part and count.
+    outcome : what an effect makes of a material at a weight
+    """
+
+    part: str
+    start: Material
+    layers: tuple[Layer, ...]
+    outcome: Outcome
+
+    @functools.cached_property
+    def local(self) -> tuple[Layer, ...]:
+        """The layers whose weight differs from point to point."""
+        return tuple(layer for layer in self.layers if layer.local)
+
+    def material(self, amounts: Sequence[float]) -> Material:
+        """Return the material where the local layers have certain amounts.
+
+        Parameters
+        ----------
+        amounts : sequence of float in [0, 1]
+            Opacity times mask of each layer of `local`.
+        """
+        given, found = iter(amounts), self.start
+        for layer in self.layers:
+            amount = next(given) if layer.local else layer.weight(self.part)
+            if amount > 0.0:
+                found = self.outcome(layer.effect, float(amount), found).material
+        return found
+
+
 class Document:
     """The present design, what it comes to, and the way back and forth.
 
@@ -184,13 +241,14 @@ class Document:
     ) -> None:
         self._palette = palette
         self._outcomes: OrderedDict[Any, tuple[Effect, Applied]] = OrderedDict()
+        self._varying: dict[str, Varying] = {}
         self._states = [Folded(dict(design.materials), {})]
         self._folded = replace(design, layers=())
         self._past: list[Design] = []
         self._future: list[Design] = []
         for layer, applied in zip(design.layers, known, strict=False):
             for part, one in applied.items():
-                self._remember(layer, part, self.materials[part], one)
+                self._remember(layer.effect, layer.weight(part), self.materials[part], one)
             materials = {part: one.material for part, one in applied.items()}
             self._states.append(Folded({**self.materials, **materials}, applied))
             self._folded = self._folded.with_layer(layer)
@@ -232,6 +290,7 @@ class Document:
         if grown:  # moves of the other traits stay as they are
             return
         self._outcomes, self._states = OrderedDict(), self._states[:1]
+        self._varying = {}
         self._folded = replace(self._folded, layers=())
         try:
             self._fold(self.design)
@@ -249,9 +308,11 @@ class Document:
             Whether to raise ValueError where its effect cannot do anything at all.
         """
         new = self.design.with_layer(layer)
-        for part, _ in layer.mask.weights if check else ():
+        for part in layer.mask.parts if check else ():
             below = self.materials[part]
-            layer.effect.check(below, self._apply(layer, part, below), self._palette)
+            full = layer.strength if layer.local else layer.weight(part)
+            found = self._outcome(layer.effect, full, below)
+            layer.effect.check(below, found, self._palette)
         self.change(new)
 
     def history(self, framing: Framing) -> list[str]:
@@ -319,27 +380,54 @@ class Document:
             kept = next(i for i, (one, other) in enumerate(pairs) if one != other)
         states = states[: kept + 1]
         for layer in design.layers[kept:]:
-            design.check_parts(part for part, _ in layer.mask.weights)
+            design.check_mask(layer)
             below = states[-1].materials
             applied = {}
-            for part, _ in layer.mask.weights:
+            for part in layer.mask.parts:
                 applied[part] = self._apply(layer, part, below[part])
             changed = {part: one.material for part, one in applied.items()}
             states.append(Folded({**below, **changed}, applied))
         self._states, self._folded = states, design
 
     def _apply(self, layer: Layer, part: str, material: Material) -> Applied:
-        key = id(layer.effect), layer.weight(part), material
+        # hidden layers as well: what is wrong with their effects is told now
+        found = self._outcome(layer.effect, layer.weight(part), material)
+        return found if layer.visible else Applied(material)
+
+    def _outcome(self, effect: Effect, weight: float, material: Material) -> Applied:
+        """Apply an effect, unless what comes of that is known."""
+        key = id(effect), weight, material
         if key in self._outcomes:
             self._outcomes.move_to_end(key)
-        else:  # hidden layers as well: what is wrong with their effects is told now
-            found = layer.effect.apply(material, layer.weight(part), self._palette)
-            self._remember(layer, part, material, found)
-        return self._outcomes[key][1] if layer.visible else Applied(material)
+        else:
+            self._remember(effect, weight, material, effect.apply(material, weight, self._palette))
+        return self._outcomes[key][1]
 
-    def _remember(self, layer: Layer, part: str, material: Material, found: Applied) -> None:
+    def _remember(self, effect: Effect, weight: float, material: Material, found: Applied) -> None:
         # the effect stands beside its outcome: while it lives, no other has its id
-        key = id(layer.effect), layer.weight(part), material
-        self._outcomes[key] = layer.effect, found
+        self._outcomes[id(effect), weight, material] = effect, found
         if len(self._outcomes) > _REMEMBERED:
             self._outcomes.popitem(last=False)
+
+    def varying(self, part: str) -> Varying | None:
+        """Return how the material of a part varies over its surface; None if it does not.
+
+        Parameters
+        ----------
+        part : str
+            Its name.
+        """
+        layers = [
+            (place, layer)
+            for place, layer in enumerate(self.design.layers)
+            if layer.strength > 0.0 and part in layer.mask.parts
+        ]
+        lowest = next((place for place, layer in layers if layer.local), None)
+        if lowest is None:
+            return None
+        above = tuple(layer for place, layer in layers if place >= lowest)
+        known = self._varying.get(part)
+        start = self._states[lowest].materials[part]
+        if known is None or (known.start, known.layers) != (start, above):
+            known = self._varying[part] = Varying(part, start, above, self._outcome)
+        return known

@@ -7,7 +7,6 @@ class in this file, named in `__all__`: painting, layers, undo, history and file
 
 from __future__ import annotations
 
-import dataclasses
 import keyword
 import math
 import re
@@ -18,8 +17,8 @@ from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from traitbrdf.reflectance import models
-from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
+from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.reflectance.parameters import CLOSED_FORMS, is_closed_form
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
 from traitbrdf.space.logmap import log_map
@@ -209,7 +208,7 @@ class Move(Effect):
         refused = found.stopped.startswith("held")
         if refused or np.array_equal(found.z, material.z):
             return Applied(material, found, refused)
-        return Applied(replace(material, z=found.z, table=None), found)
+        return Applied(replace(material, z=found.z, table=None, model=None), found)
 
     def check(self, material: Material, applied: Applied, palette: Palette) -> None:
         """Raise ValueError where held traits forbid the move."""
@@ -264,8 +263,9 @@ class Assign(Effect):
 
     Notes
     -----
-    A weight below 1 goes straight from the material below to this one, in coordinates and in
-    log f of what tables have beside them.
+    A weight below 1 is a mixture: the surface is covered by this material to that share, so f goes
+    straight from the one below to this one, and so does every frame. (A way that is straight in
+    log f leads through dark materials that are neither.)
     """
 
     anywhere: ClassVar[bool] = False
@@ -289,7 +289,7 @@ class Assign(Effect):
     def apply(self, material: Material, weight: float, palette: Palette) -> Applied:
         """Go a share `weight` of the way to the new material; see `Effect.apply`."""
         new = self.resolved(palette)
-        return Applied(new if weight >= 1.0 else blended(material, new, weight))
+        return Applied(mixed(material, new, weight, palette.embedding))
 
     def resolved(self, palette: Palette) -> Material:
         """Return the material to assign; a table is encoded once.
@@ -316,7 +316,7 @@ class Assign(Effect):
     def table(self) -> Reflectance | None:
         """The table or measured BRDF, which no Python source can state; None for all else."""
         given = self.material
-        if isinstance(given, (str, tuple)) or _stated(given):
+        if isinstance(given, (str, tuple)) or is_closed_form(given):
             return None
         return given  # type: ignore[no-any-return]
 
@@ -355,11 +355,7 @@ class Assign(Effect):
         return cls(given, (palette.library, known))
 
 
-MODELS = {
-    kind
-    for kind in vars(models).values()
-    if isinstance(kind, type) and issubclass(kind, models.Model) and dataclasses.is_dataclass(kind)
-}
+MODELS = frozenset(CLOSED_FORMS.values())
 """Closed forms, whose `repr` is Python source (with `tb.models.` before each name)."""
 _MODEL_NAMES = re.compile(rf"\b({'|'.join(sorted(kind.__name__ for kind in MODELS))})(?=\()")
 
@@ -409,15 +405,13 @@ class Tint(Effect):
             return Applied(material)
         embedding = palette.embedding
         grid, values = embedding.grid_, material.values(embedding)
-        theta_h, theta_d, _ = grid.node_angles()
-        plain = (np.abs(theta_h - _PLAIN_H) < 0.2) & (theta_d < _PLAIN_D)
-        body = np.minimum(values, _BODY * np.median(values[plain.ravel()], axis=0))
+        body = body_of(values, grid)
         tinted = {"body": body, "reflections": values - body, "all": values}[self.of]
         tinted = np.asarray(values + (factors - 1.0) * tinted, np.float32)
         # coordinates follow as far as the manifold goes, so that scores know the colour; what is
         # left stands beside them
-        logs = np.stack([np.ascontiguousarray(log_map(f).T) for f in (values, tinted)])
-        before, after = embedding.least_squares(logs)
+        logs = np.ascontiguousarray(log_map(tinted).T)[None]
+        before, after = material.least_squares(embedding), embedding.least_squares(logs)[0]
         z = embedding.clip(material.z + after - before)
         table = TabulatedBRDF(grid, np.maximum(tinted, 0.0).reshape(*grid.shape, 3))
         mirror = (
@@ -427,6 +421,22 @@ class Tint(Effect):
         return Applied(Material(z, mirror, offset, None, material.name))
 
 
+def body_of(values: Float32, grid: HalfDiffGrid) -> Float32:
+    """Return the share (cells, 3) of a table that its body scatters: min(f, b).
+
+    The level b is read where neither highlight nor grazing light matters; see `Tint`.
+
+    Parameters
+    ----------
+    values : (cells, 3) float32, f in 1/sr
+    grid : HalfDiffGrid
+    """
+    theta_h, theta_d, _ = grid.node_angles()
+    plain = (np.abs(theta_h - _PLAIN_H) < 0.2) & (theta_d < _PLAIN_D)
+    level = _BODY * np.median(values[plain.ravel()], axis=0)
+    return np.asarray(np.minimum(values, level), np.float32)
+
+
 _PLAIN_H, _PLAIN_D = math.radians(55.0), math.radians(40.0)
 """Around these angles neither highlight nor grazing light matters."""
 
@@ -434,32 +444,32 @@ _BODY = 1.35
 """The body's level at normal incidence, relative to those angles, where a coat transmits less."""
 
 
-def _stated(model: object) -> bool:
-    """Whether the `repr` of a model, its parts included, is Python source."""
-    if type(model) not in MODELS:
-        return False
-    inner = [getattr(model, f.name) for f in fields(model)]  # type: ignore[arg-type]
-    inner += [one for value in inner if isinstance(value, tuple) for one in value]
-    return all(_stated(one) for one in inner if callable(getattr(one, "eval", None)))
+def mixed(old: Material, new: Material, weight: float, embedding: BRDFEmbedding) -> Material:
+    """Return the mixture of two materials, of which the new one covers a share in [0, 1].
 
+    f and mirrors are interpolated; 0 and 1 return the ends. Coordinates follow as far as the
+    manifold goes.
 
-def blended(old: Material, new: Material, weight: float) -> Material:
-    """Return the material at a share `weight` in [0, 1] of the straight way between two.
-
-    Coordinates, log f beyond the manifold and mirrors are interpolated; 0 and 1 return the ends.
+    Parameters
+    ----------
+    old, new : Material
+    weight : float
+    embedding : BRDFEmbedding
     """
-    if weight <= 0.0:
+    if weight <= 0.0 or old == new:
         return old
     if weight >= 1.0:
         return new
-    offset: Float32 | None = None
-    for end, share in ((old, 1.0 - weight), (new, weight)):
-        if end.offset is not None:
-            part = np.asarray(share * end.offset, np.float32)
-            offset = part if offset is None else offset + part
-    z = old.z + weight * (new.z - old.z)
+    ends = old.values(embedding), new.values(embedding)
+    values = np.asarray(ends[0] + np.float32(weight) * (ends[1] - ends[0]), np.float32)
+    grid = embedding.grid_
+    # least squares are relative to those of the ends, where they need not be what is known of them
+    far, near = (one.z - one.least_squares(embedding) for one in (new, old))
+    logs = np.ascontiguousarray(log_map(values).T)[None]
+    z = embedding.clip(embedding.least_squares(logs)[0] + near + weight * (far - near))
+    table = TabulatedBRDF(grid, values.reshape(*grid.shape, 3))
     mirror = old.mirror + weight * (new.mirror - old.mirror)
-    return Material(z, mirror, offset, None, new.name)
+    return Material(z, mirror, embedding.residual(table, z), None, new.name)
 
 
 def names_of(names: Iterable[str], what: str) -> tuple[str, ...]:

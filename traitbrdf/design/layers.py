@@ -7,9 +7,10 @@ import math
 from dataclasses import dataclass, field
 
 from traitbrdf.design.effects import Effect, Move, Named, table_name
-from traitbrdf.design.masks import Framing, Painted, Parts
+from traitbrdf.design.masks import Brushed, Framing, Local, Mask, Painted, Parts
 
-_KEYS = itertools.count()
+KEYS = itertools.count()
+"""Numbers that tell layers apart."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Layer:
     Attributes
     ----------
     effect : Effect, what changes
-    mask : Parts, where and how much
+    mask : Mask, where and how much
     opacity : in [0, 1], scales the effect
     visible : whether the layer counts at all
     name : for people; may be empty
@@ -29,16 +30,16 @@ class Layer:
     """
 
     effect: Effect
-    mask: Parts
+    mask: Mask
     opacity: float = 1.0
     visible: bool = True
     name: str = ""
-    key: int = field(default_factory=lambda: next(_KEYS), compare=False, repr=False)
+    key: int = field(default_factory=lambda: next(KEYS), compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.effect, Effect):
             raise TypeError(f"effect: expected an effect such as tb.Move, got {self.effect!r}")
-        if not isinstance(self.mask, Parts):
+        if not isinstance(self.mask, Mask):
             raise TypeError(f"mask: expected a mask, got {self.mask!r}")
         if isinstance(self.opacity, bool) or not isinstance(self.opacity, (int, float)):
             raise TypeError(f"opacity: expected a number, got {self.opacity!r}")
@@ -50,8 +51,18 @@ class Layer:
             raise TypeError(f"name: expected a string, got {self.name!r}")
         object.__setattr__(self, "opacity", float(self.opacity))
 
+    @property
+    def local(self) -> bool:
+        """Whether its mask differs from point to point."""
+        return isinstance(self.mask, Local)
+
     def weight(self, part: str) -> float:
-        """Return how much of the effect a part gets: 0 where the layer does not count."""
+        """Return how much of the effect the whole of a part gets.
+
+        It is 0 where the layer does not count, and where only some of the part gets it.
+        """
+        if isinstance(self.mask, Local):
+            return 0.0
         return self.strength * dict(self.mask.weights).get(part, 0.0)
 
     @property
@@ -62,9 +73,9 @@ class Layer:
     @property
     def anywhere(self) -> set[str]:
         """The parts that the layer may lead anywhere in the gamut."""
-        if not self.effect.anywhere and self.opacity == 1.0:
+        if not self.effect.anywhere and self.opacity == 1.0 and not self.local:
             return set()
-        return {part for part, _ in self.mask.weights}
+        return set(self.mask.parts)
 
     def calls(self, framing: Framing, named: Named = table_name, idle: bool = False) -> list[str]:
         """Return the Python statements that add the layer to an `EditSession`.
@@ -86,10 +97,32 @@ class Layer:
             )
             if value != usual
         ]
-        return [self._added(framing, named, idle), *settings]
+        if isinstance(self.mask, Local):
+            return [*self._painted(self.mask, framing, named), *settings]
+        return [self._added(self.mask, framing, named, idle), *settings]
 
-    def _added(self, framing: Framing, named: Named, idle: bool) -> str:
-        mask, effect = self.mask, self.effect
+    def _painted(self, mask: Local, framing: Framing, named: Named) -> list[str]:
+        """Return the statements that paint a local mask."""
+        effect = self.effect.source(named)
+        strokes = [*mask.strokes]
+        said = []
+        if strokes and not strokes[0].erase:
+            first = strokes.pop(0)
+            stroke, how = _drawn(first, framing)
+            said.append(f"edit.paint({stroke}, {effect}, where='local'{how})")
+        else:
+            said.append(f"edit.layers.add({effect})")
+        for one in strokes:
+            call = "erase" if one.erase else "paint"
+            said.append(f"edit.layers[-1].{call}({''.join(_drawn(one, framing))})")
+        if mask.only is not None:
+            said.append(f"edit.layers[-1].clip({mask.only!r})")
+        if mask.inverted:
+            said.append("edit.layers[-1].invert()")
+        return said
+
+    def _added(self, mask: Parts, framing: Framing, named: Named, idle: bool) -> str:
+        effect = self.effect
         if not isinstance(mask, Painted) or mask.framing != framing:
             if idle:
                 return f"edit.apply({mask.source()}, {effect.source(named)})"
@@ -113,8 +146,26 @@ class Layer:
         hidden = "" if self.visible else ", hidden"
         faint = "" if self.opacity == 1.0 else f", opacity {self.opacity:g}"
         name = f"{self.name!r}: " if self.name else ""
-        where = ", ".join(
-            part if weight == 1.0 else f"{part} ({weight:.0%})"
-            for part, weight in self.mask.weights
-        )
+        if isinstance(self.mask, Local):
+            count = len(self.mask.strokes)
+            where = f"{', '.join(self.mask.parts) or 'nothing'} ({count} strokes"
+            where += ", inverted)" if self.mask.inverted else ")"
+        else:
+            where = ", ".join(
+                part if weight == 1.0 else f"{part} ({weight:.0%})"
+                for part, weight in self.mask.weights
+            )
         return f"{name}{self.effect!r} on {where}{faint}{hidden}"
+
+
+def _drawn(one: Brushed, framing: Framing) -> tuple[str, str]:
+    """Return a stroke on the surface, and the keywords it is painted with, as Python source."""
+    stroke = one.stroke
+    said = [repr([*stroke.points]), f"radius={float(stroke.radius)!r}"]
+    for name, usual in (("hardness", 0.5), ("flow", 1.0), ("pressure", None), ("units", "pixels")):
+        value = getattr(stroke, name)
+        if value != usual:
+            said.append(f"{name}={value!r}")
+    across = ", across=True" if one.across else ""
+    seen = "" if one.framing == framing else f", framing={one.framing.source()}"
+    return f"tb.Stroke({', '.join(said)})", across + seen

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from traitbrdf.design.document import Design, Document, Recorded
 from traitbrdf.design.effects import KINDS, MODELS, Applied, Assign, Palette
 from traitbrdf.design.layers import Layer
-from traitbrdf.design.masks import Framing, Painted, Parts
+from traitbrdf.design.masks import Brushed, Framing, Local, Painted, Parts
 from traitbrdf.design.strokes import Stroke
 from traitbrdf.formats.files import FormatError, read_arrays, write_arrays
 from traitbrdf.reflectance.brdf import TabulatedBRDF
+from traitbrdf.reflectance.models import Model
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, Light, PointLight
 from traitbrdf.scene.scene import Scene
@@ -34,13 +35,17 @@ from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace, default_traits
 
-_FORMAT = 3
+_FORMAT = 4
+_LAYERED = (3, _FORMAT)  # formats with layers
 SETTINGS = ("quality", "error", "fps", "seed")
 """Settings of a session that a file keeps."""
 
 _VALUES: dict[str, type[Any]] = {
     **KINDS,
-    **{kind.__name__: kind for kind in (Parts, Painted, Framing, Stroke, Camera, *MODELS)},
+    **{
+        kind.__name__: kind
+        for kind in (Parts, Painted, Local, Brushed, Framing, Stroke, Camera, *MODELS)
+    },
 }
 """Values that may stand in the fields of effects and masks, by the name that a file gives them."""
 
@@ -138,6 +143,7 @@ class _Pool:
                 "name": material.name,
                 "offset": self._table(material.offset),
                 "table": self._table(material.table),
+                "model": self.plain(material.model),
             })  # fmt: skip
         return self._places[material]
 
@@ -198,7 +204,7 @@ class Stored:
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> Stored:
-        """Read what `write_design` wrote, of format 1 to 3.
+        """Read what `write_design` wrote, of format 1 to 4.
 
         Raises
         ------
@@ -209,7 +215,7 @@ class Stored:
             header = json.loads(str(arrays["design"]))
             if header["format"] == 1:
                 header = {**header, **_BEFORE_SHADOWS, "anywhere": [""] * len(header["history"])}
-            elif header["format"] not in (2, _FORMAT):
+            elif header["format"] not in (2, *_LAYERED):
                 raise FormatError(
                     path, f"a design of format 1 to {_FORMAT}", f"{header['format']!r}"
                 )
@@ -238,7 +244,7 @@ class Stored:
                 raise FormatError(
                     self.path, f"a design of embedding {expected}", f"embedding {made}"
                 )
-            if self.header["format"] == _FORMAT:
+            if self.header["format"] in _LAYERED:
                 return self._layered(palette)
             return Document(self._baked(palette.embedding), palette)
 
@@ -267,20 +273,7 @@ class Stored:
         header, arrays = self.header, self.arrays
         # one array for all materials that share it: they are equal then
         tables = {name: value for name, value in arrays.items() if name.startswith("table_")}
-        materials = [
-            _saved_material(
-                palette.embedding,
-                str(entry["name"]),
-                arrays["points"][i],
-                arrays["mirrors"][i],
-                *(
-                    None if entry[kind] is None else tables[f"table_{entry[kind]}"]
-                    for kind in ("offset", "table")
-                ),
-            )
-            for i, entry in enumerate(header["materials"])
-        ]
-
+        materials: list[Material] = []
         effects: dict[str, Any] = {}  # equal ones are one object, and so are their tables
 
         def value(plain: Any) -> Any:
@@ -298,6 +291,22 @@ class Stored:
                 return effects[said]
             return _VALUES[plain["is"]](**state)
 
+        def table_at(place: int | None) -> NDArray[Any] | None:
+            return None if place is None else tables[f"table_{place}"]
+
+        materials += [
+            _saved_material(
+                palette.embedding,
+                str(entry["name"]),
+                arrays["points"][i],
+                arrays["mirrors"][i],
+                table_at(entry["offset"]),
+                table_at(entry["table"]),
+                value(entry.get("model")),
+            )
+            for i, entry in enumerate(header["materials"])
+        ]
+
         def placed(places: Mapping[str, int]) -> dict[str, Material]:
             return {part: materials[place] for part, place in places.items()}
 
@@ -307,12 +316,8 @@ class Stored:
         for entry in header["layers"]:
             layer = Layer(**{f.name: value(entry[f.name]) for f in _LAYER})
             after = placed(entry["after"])
-            if [*after] != [
-                part for part, _ in layer.mask.weights
-            ] or not after.keys() <= below.keys():
-                raise ValueError(
-                    f"layers: expected outcomes of {layer.mask.weights}, got {[*after]}"
-                )
+            if (*after,) != layer.mask.parts or not after.keys() <= below.keys():
+                raise ValueError(f"layers: expected outcomes of {layer.mask.parts}, got {[*after]}")
             layers.append(layer)
             refused = set(entry["refused"])
             known.append({part: Applied(one, None, part in refused) for part, one in after.items()})
@@ -379,11 +384,14 @@ def _saved_material(
     mirror: NDArray[Any],
     offset: NDArray[Any] | None,
     table: NDArray[Any] | None,
+    model: Model | None = None,
 ) -> Material:
     shape = (embedding.grid_.size, 3)
     for kind, value in (("offset", offset), ("table", table)):
         if value is not None and not (value.shape == shape and np.isfinite(value).all()):
             raise ValueError(f"{kind}: expected finite numbers of shape {shape}, got {value.shape}")
+    if model is not None and not isinstance(model, Model):
+        raise TypeError(f"model: expected a closed form, got {model!r}")
     black = np.zeros((*embedding.grid_.shape, 3), np.float32)
     values = black if table is None else table.reshape(black.shape)
     # checks the values and the weight
@@ -394,4 +402,5 @@ def _saved_material(
         None if offset is None else np.asarray(offset, np.float32),
         None if table is None else np.asarray(table, np.float32),
         name,
+        model,
     )

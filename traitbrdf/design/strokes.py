@@ -1,6 +1,7 @@
 """Painted strokes: polylines on the image, and how much of each region they cover.
 
-This module works on arrays only; it knows neither scenes nor BRDFs. Image coordinates are pixels: x
+This module works on arrays only; it knows neither scenes nor BRDFs (`traitbrdf.scene.trails` puts
+strokes on surfaces). Image coordinates are pixels: x
 counts columns from the left, y rows from the top, and the centre of the first pixel is (0.5, 0.5).
 """
 
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,10 +35,18 @@ class Stroke:
     amount : float
         Change of the trait's score; 1 leads from a typically low to a typically high score.
     radius : float
-        Radius of the brush in pixels, positive. The brush has full strength in its inner half and
-        fades to zero at its rim.
+        Radius of the brush, positive.
     hold : iterable of str, or None
         What the edit holds constant, as for `EditSession.move`; None is the default of the trait.
+    hardness : float
+        Share of the radius, in [0, 1], within which the brush has full strength; beyond it the
+        brush fades to zero at its rim.
+    flow : float
+        How much paint comes out, in (0, 1], of a stroke that is painted locally.
+    pressure : sequence of float, or None
+        Pressure of the pen at each point, in [0, 1], by which the flow is multiplied; None is 1.
+    units : "pixels" or "world"
+        Of the radius: pixels of the image, or units of the world (strokes painted locally alone).
 
     Raises
     ------
@@ -59,6 +68,10 @@ class Stroke:
     amount: float = 0.0
     radius: float = 24.0
     hold: Iterable[str] | None = None
+    hardness: float = 0.5
+    flow: float = 1.0
+    pressure: Sequence[float] | None = None
+    units: str = "pixels"
 
     def __post_init__(self) -> None:
         try:
@@ -71,7 +84,7 @@ class Stroke:
             raise ValueError(f"points: expected finite coordinates of at most {_FURTHEST:g} pixels")
         if self.trait is not None and not isinstance(self.trait, str):
             raise TypeError(f"trait: expected a name, got {self.trait!r}")
-        for name in ("amount", "radius"):
+        for name in ("amount", "radius", "hardness", "flow"):
             value = getattr(self, name)
             if not isinstance(value, (int, float, np.floating, np.integer)):
                 raise TypeError(f"{name}: expected a number, got {value!r}")
@@ -82,8 +95,16 @@ class Stroke:
                 f"radius: expected a positive number of pixels up to {_FURTHEST:g}, "
                 f"got {self.radius!r}"
             )
+        if not 0.0 <= self.hardness <= 1.0:
+            raise ValueError(f"hardness: expected 0 to 1, got {self.hardness!r}")
+        if not 0.0 < self.flow <= 1.0:
+            raise ValueError(f"flow: expected above 0, up to 1, got {self.flow!r}")
+        if self.units not in ("pixels", "world"):
+            raise ValueError(f"units: expected 'pixels' or 'world', got {self.units!r}")
         points = tuple((float(x), float(y)) for x, y in line)
         object.__setattr__(self, "points", points)
+        if self.pressure is not None:
+            object.__setattr__(self, "pressure", _pressures(self.pressure, len(points)))
         if self.hold is not None:
             try:
                 hold = (self.hold,) if isinstance(self.hold, str) else tuple(self.hold)
@@ -107,12 +128,15 @@ class Stroke:
         squared = squared[y0:y1, x0:x1]
         # clipped at the rim, so that a tiny radius cannot cause an overflow
         away = np.minimum(np.sqrt(squared), self.radius)
-        fade = np.clip(2.0 - 2.0 * away / self.radius, 0.0, 1.0)
+        fade = np.clip((1.0 - away / self.radius) / max(1.0 - self.hardness, 1e-3), 0.0, 1.0)
         result[y0:y1, x0:x1] = fade * fade * (3.0 - 2.0 * fade)
         return result
 
     def extended(
-        self, points: Sequence[tuple[float, float]], amount: float | None = None
+        self,
+        points: Sequence[tuple[float, float]],
+        amount: float | None = None,
+        pressure: Sequence[float] | None = None,
     ) -> Stroke:
         """Return this stroke with more points.
 
@@ -125,6 +149,8 @@ class Stroke:
             Points to append.
         amount : float or None
             The new amount; None keeps it.
+        pressure : sequence of float, or None
+            Pressure at the points to append, if this stroke has pressures.
 
         Raises
         ------
@@ -132,7 +158,8 @@ class Stroke:
             As for a new stroke.
         """
         amount = self.amount if amount is None else amount
-        longer = Stroke((*self.points, *points), self.trait, amount, self.radius, self.hold)
+        pressed = None if self.pressure is None else (*self.pressure, *(pressure or ()))
+        longer = replace(self, points=(*self.points, *points), amount=amount, pressure=pressed)
         known = self.__dict__.pop("_measured", None)
         if known is not None:
             object.__setattr__(longer, "_measured", known)
@@ -170,6 +197,19 @@ class Stroke:
             np.minimum(near, away, out=near)
         object.__setattr__(self, "_measured", (squared, box, len(line)))
         return squared, box
+
+
+def _pressures(given: object, count: int) -> tuple[float, ...]:
+    """Return the pressures of a stroke of some points; errors are raised as `Stroke` does."""
+    try:
+        pressed = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"pressure: expected numbers, got {given!r}") from None
+    if pressed.shape != (count,):
+        raise ValueError(f"pressure: expected one for each of {count} points, got {pressed.shape}")
+    if not ((pressed >= 0.0) & (pressed <= 1.0)).all():
+        raise ValueError(f"pressure: expected 0 to 1, got {given!r}")
+    return tuple(pressed.tolist())
 
 
 def region_weights(

@@ -37,6 +37,22 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
     return np.asarray(255.0 * encoded + 0.5).astype(np.uint8)
 
 
+def decode_srgb(encoded: ArrayLike) -> NDArray[np.float64]:
+    """Return the linear Rec.709 values of sRGB ones.
+
+    Parameters
+    ----------
+    encoded : array_like
+        In [0, 1]; 8-bit values divided by 255.
+
+    Returns
+    -------
+    float64 array of the same shape
+    """
+    x = np.asarray(encoded, np.float64)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
 def exposure_of(linear: ArrayLike) -> float:
     """Return the exposure that maps the 90th percentile of an image to a bright value.
 

@@ -237,6 +237,17 @@ def _bracket_uniform(x: Float64, count: int) -> _Bracket:
     return low, low + 1, np.clip(x - low, 0.0, 1.0)
 
 
+_KEPT = 100_000
+"""Nodes of the greatest grid whose directions are kept once they have been computed."""
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_directions(grid: HalfDiffGrid) -> tuple[Float64, Float64]:
+    wi, wo = grid.node_directions()
+    wi.flags.writeable = wo.flags.writeable = False
+    return wi, wo
+
+
 class TabulatedBRDF:
     """An isotropic BRDF given by its values on a half/difference grid.
 
@@ -300,7 +311,7 @@ class TabulatedBRDF:
         dtype : float32 or float64
             Type of the table.
         """
-        wi, wo = grid.node_directions()
+        wi, wo = _kept_directions(grid) if grid.size < _KEPT else grid.node_directions()
         return cls(grid, model.eval(wi, wo).astype(dtype), model.mirror, name)
 
     @classmethod

@@ -371,6 +371,16 @@ class Scene:
         same = (hits.part == self._sample_part[own])[:, None]
         return np.where(same, hits.start, self.starts[own]).reshape(len(index), count, 3)
 
+    def hits(self, x: Float64, y: Float64) -> Hits:
+        """Return what is seen at image positions: the part, -1 for none, its position and normal.
+
+        Parameters
+        ----------
+        x, y : (n,) float64 arrays
+            In pixels from the top left corner.
+        """
+        return self._shoot(self.camera.position(self.shape, self.height, self.width), x, y)
+
     def reached(self, points: Float64, directions: Float64) -> Float64:
         """Return where rays first meet the shape or the ground: (n, 3), NaN where they do not.
 

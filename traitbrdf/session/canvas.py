@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from traitbrdf.transport.transport import PartFrame, Transport
+from traitbrdf.transport.basis import PartFrame
+from traitbrdf.transport.transport import Transport
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -45,6 +46,7 @@ class Canvas:
         # the share of the pixel that shows the backdrop is a part of the sum as well
         self._mixed = (several | (scene.uncovered > 0.0))[scene.pixels]
         self._patches: dict[int | None, tuple[torch.Tensor, list[Any]]] = {}
+        self._mixed_parts: dict[int, torch.Tensor] = {}
         self.drawn: list[PartFrame] = []
         self._free: list[_Page] = []
         self.pixels = self._backdrop
@@ -61,6 +63,13 @@ class Canvas:
         if drawn:
             pairs = zip(frames, drawn, strict=True)
             self.changed = [i for i, (new, old) in enumerate(pairs) if new is not old]
+            if len(self.changed) == 1:
+                ((i,), old) = self.changed, drawn[self.changed[0]]
+                since = frames[i].since
+                if since is not None and since[0] == old.serial:
+                    self._touch(i, since[1], frames)
+                    self.drawn = frames
+                    return
             self.redraw(self.changed, frames)
         else:
             self.changed = list(range(len(frames)))
@@ -86,6 +95,29 @@ class Canvas:
             for i, fragments, place in places:
                 sums.index_add_(0, place, frames[i].radiance[fragments])
             self.pixels.index_copy_(0, pixels, sums)
+
+    def _touch(self, part: int, fragments: torch.Tensor, frames: list[PartFrame]) -> None:
+        """Draw the pixels of some fragments of a part."""
+        known = self._transport.parts[part]
+        if known is None or not len(fragments):
+            return
+        pixels = known.pixels[fragments]
+        mixed = self._mixed_here(part)[fragments]
+        plain = ~mixed
+        self.pixels.index_copy_(0, pixels[plain], frames[part].radiance[fragments[plain]])
+        if bool(mixed.any()):
+            pixels, places = self._patch(part)
+            sums = self._backdrop[pixels]
+            for i, others, place in places:
+                sums.index_add_(0, place, frames[i].radiance[others])
+            self.pixels.index_copy_(0, pixels, sums)
+
+    def _mixed_here(self, part: int) -> torch.Tensor:
+        """Return which fragments of a part share their pixel."""
+        if part not in self._mixed_parts:
+            span = self._transport.scene.part_slice(part)
+            self._mixed_parts[part] = torch.from_numpy(self._mixed[span]).to(self._transport.device)
+        return self._mixed_parts[part]
 
     def _patch(self, part: int | None) -> tuple[torch.Tensor, list[Any]]:
         """Find the border pixels that show a part (None: any part).

@@ -7,26 +7,36 @@ and redoes them one at a time. `traitbrdf.session.viewer` prepares the scene and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from traitbrdf.design.document import Design, Document
+from traitbrdf.design.colours import Colour
+from traitbrdf.design.document import Design, Document, Varying
 from traitbrdf.design.effects import Assign, Assignable, Effect, Move, Palette, names_of
 from traitbrdf.design.layers import Layer
-from traitbrdf.design.masks import Framing, Painted, Parts, Target
+from traitbrdf.design.masks import Brushed, Framing, Local, Painted, Parts, Seen, Target
+from traitbrdf.design.parameters import Parameters
 from traitbrdf.design.stack import Layers
 from traitbrdf.design.storage import SETTINGS, Stored, reading, write_design
 from traitbrdf.design.strokes import Stroke, region_weights
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
+from traitbrdf.scene.camera import image_size
+from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.budget import quality_for
+from traitbrdf.session.frames import View
+from traitbrdf.session.picking import Picked, lobe_at, pick, white_at
 from traitbrdf.session.preparation import EXACT_ABOVE
 from traitbrdf.session.report import part_report, view_report
 from traitbrdf.session.settings import Asked, Settings
+from traitbrdf.session.sheets import Sheet
+from traitbrdf.session.surface import touched
 from traitbrdf.session.viewer import Viewer
 from traitbrdf.space.learning import Trait
 from traitbrdf.space.library import Library, default_library
@@ -39,6 +49,7 @@ from traitbrdf.transport.visibility import Progress
 Float32 = NDArray[np.float32]
 _FIRST_MATERIAL = "white-plastic"
 _FIRST_GROUND = "concrete"
+_MEASURED = 96  # fragments at which the error of local paint is measured
 
 
 class EditSession(Viewer):
@@ -121,8 +132,14 @@ class EditSession(Viewer):
 
     @property
     def materials(self) -> Mapping[str, Material]:
-        """The material of every part, all layers counted."""
+        """The material of every part where nothing is painted locally, all other layers counted."""
         return self._document.materials
+
+    @property
+    def varying(self) -> Mapping[str, Varying]:
+        """How the material of parts that are painted locally varies, by part."""
+        found = {part: self._document.varying(part) for part in self.scene.parts}
+        return {part: one for part, one in found.items() if one is not None}
 
     def material(self, part: str) -> Material:
         """Return the material of a part.
@@ -145,18 +162,48 @@ class EditSession(Viewer):
         """
         return self.traits.score(self.material(part).z)
 
-    def brdf(self, part: str) -> TabulatedBRDF:
+    def brdf(self, part: str, at: tuple[float, float] | None = None) -> TabulatedBRDF:
         """Return a part's material as a table; ``.write("x.binary")`` saves it.
 
         Parameters
         ----------
         part : str
             Its name.
+        at : (x, y) or None
+            In pixels of the image, where the part is seen: the material there, all that is painted
+            locally included. None is the material where nothing is.
+
+        Raises
+        ------
+        ValueError
+            If the part is not seen there.
         """
         material = self.material(part)
+        if at is not None:
+            seen = self.pick(*at)
+            if seen is None or seen.part != part:
+                other = "nothing" if seen is None else repr(seen.part)
+                raise ValueError(f"at: expected a pixel that shows {part!r}, got {other} at {at}")
+            material = seen.material
         grid = self.embedding.grid_
         values = material.values(self.embedding).reshape(*grid.shape, 3)
         return TabulatedBRDF(grid, values, material.mirror, material.name or part)
+
+    def pick(self, x: float, y: float) -> Picked | None:
+        """Return what is seen at a place of the image; None where no part is.
+
+        Parameters
+        ----------
+        x, y : float
+            Pixels from the top left corner.
+
+        Examples
+        --------
+        >>> print(edit.pick(64, 70))  # doctest: +SKIP
+        body: red-rubber; layers: 0 'base', 2 (40 %)
+        """
+        with self._lock:
+            return pick(self.scene, (float(x), float(y)), self._document, self.traits)
 
     def plausibility(self, part: str) -> dict[str, float]:
         """Return ``energy_scale``, ``gamut_margin`` and ``plausibility`` as `report` has them.
@@ -233,6 +280,94 @@ class EditSession(Viewer):
         move = Move(amounts, hold=hold, photoreal=photoreal, **more)
         self._add(Layer(move, Parts.of(part)), check=True)
 
+    def set_parameters(
+        self,
+        part: Target,
+        model: str | Mapping[str, Any] | None = None,
+        values: Mapping[str, Any] | None = None,
+        /,
+        **more: Any,
+    ) -> None:
+        """Set parameters of closed forms: ``edit.set_parameters("lid", "GGX", alpha=0.1)``.
+
+        Parameters
+        ----------
+        part : name or names of parts, or a weight in [0, 1] for each
+        model : str, optional
+            What the material becomes; left out, it has to be a closed form already.
+        values : mapping of name to value, optional
+            For names that are no Python identifiers, such as "base.alpha".
+        **more : float or (3,) array_like
+            A value for each named parameter. A new layer of `tb.Parameters` sets them.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `tb.Parameters` does, and where a material is no closed form, has no parameter of
+            such a name, or does not accept the value. Nothing is changed then.
+        """
+        self._add(Layer(Parameters(model, values, **more), Parts.of(part)), check=True)
+
+    def set_colour(self, part: Target, rgb: Sequence[float] | str, space: str = "linear") -> None:
+        """Give bodies exactly a colour: ``edit.set_colour("lid", "#b03030")``.
+
+        Parameters
+        ----------
+        part : name or names of parts, or a weight in [0, 1] for each
+        rgb, space
+            As `tb.Colour` has them.
+
+        Raises
+        ------
+        ValueError, TypeError
+            On an unknown part, as `tb.Colour` does, or where body and reflections would reflect
+            more light than arrives; the message names the nearest colour. Nothing is changed then.
+        """
+        self._add(Layer(Colour(rgb, space), Parts.of(part)), check=True)  # type: ignore[arg-type]
+
+    def highlight(
+        self,
+        at: tuple[float, float],
+        intensity: float = 1.0,
+        width: float = 8.0,
+        radius: float = 24.0,
+        rgb: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> float:
+        """Create a highlight at a place of the image, under the present light: a local layer.
+
+        Parameters
+        ----------
+        at : (x, y) in pixels
+        intensity : float
+            Radiance that is added there, as a share of what a white matte surface would show.
+        width : float
+            Full width of the lobe at half its height, in degrees of theta_h.
+        radius : float
+            Of the soft stroke that it is painted with, in pixels.
+        rgb : (3,)
+            Its colour, linear Rec.709 in [0, 1].
+
+        Returns
+        -------
+        float
+            The intensity that is reached: less than asked for where more would reflect more light
+            than arrives.
+
+        Raises
+        ------
+        ValueError
+            If no part is seen there, no light arrives, or a number is out of range.
+        """
+        with self._prepared() as (view, transport):
+            effect = lobe_at(view.scene, transport, at, intensity, width, rgb)
+            before = self._frame(view, transport)
+            stroke = Stroke([at], radius=radius, hardness=0.0)
+            self.paint(stroke, effect, where="local")
+            self.prepare()  # the ground may have been prepared for one material
+            y, x = int(at[1]), int(at[0])
+            added = float((self.render() - before)[y, x].mean())
+            return added / white_at(view.scene, transport, at)
+
     def apply(self, part: Target, effect: Effect) -> None:
         """Put a layer of any effect on parts: ``edit.apply("handle", tb.Move(shiny=0.6))``.
 
@@ -249,7 +384,8 @@ class EditSession(Viewer):
         Notes
         -----
         A move that held traits forbid becomes a layer that does nothing, until the layers below it
-        change; `move` refuses it.
+        change; `move` refuses it. So do parameters that the material below lacks, which
+        `set_parameters` refuses.
         """
         self._add(Layer(effect, Parts.of(part)))
 
@@ -258,20 +394,31 @@ class EditSession(Viewer):
         stroke: Stroke,
         effect: Effect | None = None,
         only: str | Iterable[str] | None = None,
+        where: str = "part",
+        across: bool = False,
+        framing: Seen | None = None,
     ) -> dict[str, float]:
-        """Paint on the image: every part under the stroke is changed by its share of it.
+        """Paint on the image: a new layer.
 
         Parameters
         ----------
         stroke : Stroke, in pixels of this scene's image
         effect : Effect; None is a move of the stroke's own trait
         only : part or parts that may change, as if there were no others; None is all
+        where : "part" or "local"
+            With "part", every part under the stroke is changed as a whole, by its share of the
+            stroke. With "local", the surface under the brush is changed, softly; further strokes go
+            onto the same layer by ``edit.layers[-1].paint``.
+        across : bool
+            Whether paint of a local stroke flows from the parts that the brush touches to others.
+        framing : (Camera, (height, width)) or None
+            Of the image that a local stroke was drawn on; None is the scene's.
 
         Returns
         -------
         dict
-            For each touched part, the amount by which the stroke's trait was moved; with an
-            `effect`, the part's weight.
+            For each touched part, the amount by which the stroke's trait was moved, at most; with
+            an `effect`, the part's weight.
 
         Raises
         ------
@@ -279,6 +426,8 @@ class EditSession(Viewer):
             If the stroke touches no part, if there is neither or both of a trait and an effect, or
             as the effect does. Nothing is changed then.
         """
+        if where not in ("part", "local"):
+            raise ValueError(f"where: expected 'part' or 'local', got {where!r}")
         if not isinstance(stroke, Stroke):
             raise TypeError(f"stroke: expected a Stroke, got {stroke!r}")
         if (effect is None) == (stroke.trait is None):
@@ -289,9 +438,32 @@ class EditSession(Viewer):
             self.traits.index(stroke.trait)
             effect, amount = Move({stroke.trait: stroke.amount}, hold=stroke.hold), stroke.amount
         with self._lock:
+            if where == "local":
+                drawn = self._brushed(stroke, False, across, framing)
+                limit = None if only is None else names_of(only, "only")
+                local = Local((drawn,), self.scene.parts, only=limit)
+                self._add(Layer(effect, local), check=own)  # type: ignore[arg-type]
+                return dict.fromkeys(local.parts, float(amount))
             mask = self._mask(stroke, only)
             self._add(Layer(effect, mask), check=own)  # type: ignore[arg-type]
         return {part: float(amount * weight) for part, weight in mask.weights}
+
+    def _brushed(self, stroke: Stroke, erase: bool, across: bool, framing: Seen | None) -> Brushed:
+        """Put a stroke on the surface."""
+        if not isinstance(stroke, Stroke):
+            raise TypeError(f"stroke: expected a Stroke, got {stroke!r}")
+        scene = self.scene
+        seen = Framing.of(scene)
+        if framing is not None:
+            seen = Framing(framing[0], *image_size(framing[1]))
+        bare = replace(stroke, trait=None, amount=0.0, hold=None)
+        parts = touched(scene, bare, seen)
+        if not parts:
+            raise ValueError(
+                "stroke: expected a stroke that touches the object, got one that lies beside "
+                f"it (image {seen.width} x {seen.height}, {len(stroke.points)} points)"
+            )
+        return Brushed(bare, seen, scene.parts if across else parts, erase, across)
 
     def _mask(self, stroke: Stroke, only: str | Iterable[str] | None) -> Painted:
         """Weigh the parts under a stroke by their share of it."""
@@ -318,7 +490,7 @@ class EditSession(Viewer):
 
     def _add(self, layer: Layer, check: bool = False) -> None:
         with self._lock:
-            for part, _ in layer.mask.weights:
+            for part in layer.mask.parts:
                 self.part(part)
             self._document.add(layer, check)
             self._edited |= layer.anywhere
@@ -367,7 +539,7 @@ class EditSession(Viewer):
     @property
     def layers(self) -> Layers:
         """The stack of layers, the lowest first: ``edit.layers[1].opacity = 0.3``; undoable."""
-        return Layers(lambda: self.design, self._change)
+        return Layers(lambda: self.design, self._change, self._brushed)
 
     @property
     def tables(self) -> dict[str, Reflectance]:
@@ -417,10 +589,158 @@ class EditSession(Viewer):
     def before(self) -> Float32:
         """Return the frame (H, W, 3) as it would be without any layer; nothing is changed."""
         # a ground that has a new material had another one before
-        self._edited |= {part for layer in self.design.layers for part, _ in layer.mask.weights}
+        self._edited |= {part for layer in self.design.layers for part in layer.mask.parts}
         with self._prepared() as (view, transport):
             materials = [self.design.materials[part] for part in view.scene.parts]
             return self.renderer.frame(view, transport, materials, exact=False)
+
+    # -- sheets ---------------------------------------------------------------------------------
+
+    def wedge(
+        self,
+        trait: str,
+        count: int = 7,
+        part: Target | None = None,
+        low: float = -1.0,
+        high: float = 1.0,
+    ) -> Sheet:
+        """Show a trait in even steps on one's own object; nothing is changed.
+
+        Parameters
+        ----------
+        trait : str
+        count : int
+            Frames, at least 2.
+        part : name or names of parts, or a weight in [0, 1] for each; None is the whole shape
+        low, high : float
+            Amounts of the first and the last frame.
+
+        Raises
+        ------
+        ValueError
+            On an unknown name or a smaller count.
+        """
+        self.traits.index(trait)
+        if isinstance(count, bool) or not isinstance(count, int) or count < 2:
+            raise ValueError(f"count: expected at least 2, got {count!r}")
+        amounts = np.linspace(low, high, count)
+        moves = [Move({trait: float(amount)}) for amount in amounts]
+        return self._sheet(moves, [f"{trait} {a:+.2f}" for a in amounts], part, count)
+
+    def variations(
+        self,
+        count: int = 9,
+        part: Target | None = None,
+        amount: float = 0.5,
+        seed: int = 0,
+    ) -> Sheet:
+        """Show the object with random moves of two traits each; nothing is changed.
+
+        Parameters
+        ----------
+        count : int
+            Frames; ``sheet.take(3)`` makes the fourth the design.
+        part : name or names of parts, or a weight in [0, 1] for each; None is the whole shape
+        amount : float
+            Of each trait, up or down.
+        seed : int
+
+        Raises
+        ------
+        ValueError
+            On an unknown part, or a count below 1.
+        """
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ValueError(f"count: expected at least 1, got {count!r}")
+        rng = np.random.default_rng(seed)
+        moves, labels = [], []
+        for _ in range(count):
+            names = rng.choice(self.traits.names, 2, replace=False)
+            amounts = {str(name): float(amount * rng.choice((-1.0, 1.0))) for name in names}
+            moves.append(Move(amounts))
+            labels.append(", ".join(f"{name} {value:+.1f}" for name, value in amounts.items()))
+        return self._sheet(moves, labels, part, math.ceil(math.sqrt(count)))
+
+    def _sheet(
+        self, effects: Sequence[Effect], labels: Sequence[str], part: Target | None, columns: int
+    ) -> Sheet:
+        """Show what effects come to."""
+        mask = Parts.of(self.scene.shape.parts if part is None else part)
+        self._edited |= set(mask.parts)
+        designs = tuple(self.design.with_layer(Layer(effect, mask)) for effect in effects)
+        images = []
+        with self._prepared() as (view, transport):
+            for design in designs:
+                document = self._document.copy()
+                document.change(design)
+                materials = [document.materials[name] for name in view.scene.parts]
+                found = {name: document.varying(name) for name in view.scene.parts}
+                varying = {name: one for name, one in found.items() if one is not None}
+                frame = self.renderer.frame(view, transport, materials, False, varying)
+                images.append(frame)
+        return Sheet(tuple(images), tuple(labels), designs, self._choose, columns)
+
+    def _choose(self, design: Design) -> None:
+        self.design = design
+
+    def under(
+        self,
+        environments: Mapping[str, EnvironmentMap],
+        draft: bool = False,
+    ) -> Sheet:
+        """Show the design under several lights at once; nothing is changed.
+
+        Parameters
+        ----------
+        environments : mapping of label to EnvironmentMap
+        draft : bool
+            Whether small, inexact frames will do, which take a second each. Finished ones have to
+            be prepared unless they are in the cache.
+
+        Raises
+        ------
+        ValueError, TypeError
+            On no map, or something that is none.
+        """
+        if not environments:
+            raise ValueError("environments: expected at least one map, got none")
+        images = []
+        for light in environments.values():
+            other = EditSession(
+                self.scene.changed(environment=light), self.quality, library=self.library,
+                traits=self.traits, error=self.error, fps=self.fps, seed=self.seed,
+                device=self.device, cache=self.settings.cache, progress=self.progress,
+            )  # fmt: skip
+            other.design = self.design
+            images.append(other.draft()[0] if draft else other.render())
+        designs = (self.design,) * len(images)
+        return Sheet(tuple(images), tuple(environments), designs, self._choose, exposures="each")
+
+    def copy_look(self, source: str, target: Target, at: tuple[float, float] | None = None) -> None:
+        """Give parts the look of another part, or of a place that is painted locally.
+
+        Parameters
+        ----------
+        source : str
+            Name of the part to copy from.
+        target : name or names of parts, or a weight in [0, 1] for each
+        at : (x, y) or None
+            As for `brdf`.
+
+        Raises
+        ------
+        ValueError
+            As `brdf` does, or on an unknown part.
+        """
+        material = self.material(source)
+        if at is not None:
+            seen = self.pick(*at)
+            if seen is None or seen.part != source:
+                raise ValueError(f"at: expected a pixel that shows {source!r}, got {at}")
+            material = seen.material
+        plain = material.offset is None and material.table is None and not material.mirror.any()
+        given = material.z.tolist() if plain else self.brdf(source, at)
+        self.assign(target, given)
 
     # -- reports --------------------------------------------------------------------------------
 
@@ -440,6 +760,9 @@ class EditSession(Viewer):
           0.5 in the middle; the smallest coordinate counts,
         - ``plausibility``, the share of the library that is less plausible,
         - ``move``, what the top layer asked of the part's traits and how far it came.
+
+        ``painted`` is None, or the error of all that is painted locally, measured at some of its
+        fragments (their number is ``fragments``) against exact rows and exact materials.
 
         ``exact_frames`` counts exact frames, ``trained_images`` the images added to bases.
         ``promise`` is what was picked for the error or speed asked for, and what was measured then
@@ -468,8 +791,19 @@ class EditSession(Viewer):
                         zip(view.scene.parts, materials, strict=True)
                     )
                 },
+                "painted": self._painted(view, transport),
                 "history": self.history,
             }
+
+    def _painted(self, view: View, transport: Transport) -> dict[str, float] | None:
+        """Return the measured error of what is painted locally, and how many fragments that is."""
+        local = view.local
+        if local is None or not self.varying:
+            return None
+        some = [(view.scene.parts.index(part), one) for part, one in self.varying.items()]
+        rng = np.random.default_rng(self.seed)
+        error, count = local.error([one.frame for one in view.shown], some, rng, _MEASURED)
+        return {"error": error, "fragments": count}
 
     # -- files ----------------------------------------------------------------------------------
 

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.design.document import Varying
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.canvas import Canvas
+from traitbrdf.session.local import LocalFrames
 from traitbrdf.session.preparation import Preparation, Prepared
+from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.space.material import Material
+from traitbrdf.transport.basis import PartFrame
 from traitbrdf.transport.drafts import Draft
 from traitbrdf.transport.nodes import NodeTransport
-from traitbrdf.transport.transport import PartFrame, Transport
+from traitbrdf.transport.transport import Transport
 
 Float32 = NDArray[np.float32]
 
@@ -33,16 +38,23 @@ class Shown:
     frame : PartFrame
     tier : how it was made
     seconds : float, what that took
+    worst : Material or None
+        Where the part is painted locally, the material that the basis shows worst.
     """
 
     frame: PartFrame
     tier: Literal["basis", "trained", "exact"]
     seconds: float
+    worst: Material | None = None
 
     @property
     def bytes(self) -> int:
         """Bytes of its radiance."""
         return self.frame.radiance.numel() * self.frame.radiance.element_size()
+
+
+MadeOf: TypeAlias = tuple[tuple[Material, ...], Mapping[str, Varying]]
+"""Materials of all parts, and how those of locally painted ones vary."""
 
 
 class Drafted(NamedTuple):
@@ -52,7 +64,7 @@ class Drafted(NamedTuple):
     """
 
     size: int
-    materials: tuple[Material, ...]
+    made_of: MadeOf
     image: Float32
     error: float
 
@@ -72,10 +84,19 @@ class View:
     budget: dict[int, int] = field(default_factory=dict)
     floor: dict[int, float] = field(default_factory=dict)
     exact_frames: int = 0
+    tried: set[tuple[int, Material]] = field(default_factory=set)
     draft: tuple[int, Draft] | None = None
     drafted: Drafted | None = None
     nodes: NodeTransport | None = None
+    weights: SurfaceWeights | None = None
+    local: LocalFrames | None = None
     times: dict[str, float] = field(default_factory=dict)
+
+    def surface(self) -> SurfaceWeights:
+        """Return what computes the weights of local masks."""
+        if self.weights is None:
+            self.weights = SurfaceWeights(self.scene)
+        return self.weights
 
     def keep(self, index: int, material: Material, shown: Shown) -> None:
         """Keep a part's shading; beyond `FRAMES_KEPT` the least recently used is dropped."""

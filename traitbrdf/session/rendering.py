@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -13,14 +13,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.design.document import Varying
 from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.frames import Shown, View
+from traitbrdf.session.local import LocalFrames
 from traitbrdf.session.preparation import TURNS, trusted_error
 from traitbrdf.session.settings import Settings
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.material import Material
-from traitbrdf.transport.basis import Basis
-from traitbrdf.transport.transport import PartFrame, Transport
+from traitbrdf.transport.basis import Basis, PartFrame
+from traitbrdf.transport.transport import Transport
 from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
@@ -72,6 +74,7 @@ class Renderer:
         transport: Transport,
         materials: Sequence[Material],
         exact: bool = True,
+        varying: Mapping[str, Varying] | None = None,
     ) -> Float32:
         """Return the frame (H, W, 3) of a prepared view; what is shown is kept with the view.
 
@@ -82,6 +85,8 @@ class Renderer:
         materials : sequence of Material, one for each part
         exact : bool
             Whether parts that the basis shows too inexactly are rendered without it.
+        varying : mapping of part to Varying, or None
+            Parts that are painted locally.
         """
         start = time.perf_counter()
         tables: dict[Material, torch.Tensor] = {}
@@ -90,6 +95,11 @@ class Renderer:
             self._shade(view, transport, i, material, tables, wanted[material] == 1, exact)
             for i, material in enumerate(materials)
         ]
+        if view.local is not None:
+            view.local.begin(exact)
+        for part, one in (varying or {}).items():
+            index = view.scene.parts.index(part)
+            shown[index] = self._painted(view, transport, index, shown[index], one, exact)
         if view.canvas is None:
             view.canvas = Canvas(transport)
         view.canvas.draw([one.frame for one in shown])
@@ -134,6 +144,37 @@ class Renderer:
         shown = Shown(frame, tier, time.perf_counter() - start)
         view.keep(index, material, shown)
         return shown
+
+    def _painted(
+        self,
+        view: View,
+        transport: Transport,
+        index: int,
+        base: Shown,
+        varying: Varying,
+        exact: bool,
+    ) -> Shown:
+        """Shade a part that is painted locally, over what it is elsewhere."""
+        start = time.perf_counter()
+        tier: Literal["basis", "trained", "exact"] = base.tier
+        while True:
+            known = view.local
+            if known is None or not known.current or known.transport is not transport:
+                known = view.local = LocalFrames(transport, self.embedding, view.surface())
+                known.begin(exact)
+            frame = known.frame(index, base.frame, varying, exact)
+            if frame.error <= self.allowed(view, index):
+                worst = None
+                break
+            # an exact image of what is shown worst makes the basis show it better
+            worst = known.worst(index, varying)
+            if not exact or (index, worst) in view.tried:
+                break
+            view.tried.add((index, worst))
+            self._exactly(view, transport, index, worst)
+            tier = "trained"
+        seconds = base.seconds + time.perf_counter() - start
+        return Shown(frame, tier, seconds, worst)
 
     def _mirror(self, material: Material) -> torch.Tensor | None:
         """Return a material's weight (3,) of a perfect mirror; None where it has none."""

@@ -25,13 +25,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.design.document import Varying
 from traitbrdf.design.effects import Palette
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap, Light
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.cache import Cache
-from traitbrdf.session.frames import Drafted, Shown, View, enlarged, measured
+from traitbrdf.session.frames import Drafted, MadeOf, Shown, View, enlarged, measured
+from traitbrdf.session.local import blends
 from traitbrdf.session.preparation import (
     DRAFT_SIZE,
     NODES,
@@ -45,11 +47,13 @@ from traitbrdf.session.preparation import (
 )
 from traitbrdf.session.rendering import Renderer
 from traitbrdf.session.settings import Settings
+from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
 from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.angles import AnglesSeen, angles_seen
+from traitbrdf.transport.blends import Blend
 from traitbrdf.transport.drafts import Draft
 from traitbrdf.transport.glances import Glances
 from traitbrdf.transport.nodes import NodeTransport
@@ -59,6 +63,9 @@ from traitbrdf.transport.visibility import Progress
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+_FEW = 4  # materials of a locally painted part in small frames
+_DECODED = 64  # tables that drafts keep
+_LEARNT = 4  # knots of local paint that are computed while others wait
 _TICK = 0.2  # seconds between two images of `frames` while a scene is prepared
 
 
@@ -104,7 +111,7 @@ class Viewer:
         self._lock = threading.RLock()
         self._view = View(scene)
         self._glances: Glances | None = None
-        self._decoded: dict[Material, Float32] = {}  # tables of the last draft
+        self._decoded: dict[Material, Float32] = {}  # tables of the latest drafts
         self._cancels = 0  # calls of `cancel`
         self._edited: set[str] = set()  # parts that a preparation has to serve all edits of
         if transport is not None:
@@ -116,6 +123,11 @@ class Viewer:
     def materials(self) -> Mapping[str, Material]:
         """The material of every part."""
         raise NotImplementedError
+
+    @property
+    def varying(self) -> Mapping[str, Varying]:
+        """How the material of parts that are painted locally varies, by part."""
+        return {}
 
     @property
     def library(self) -> Library:
@@ -413,15 +425,15 @@ class Viewer:
             with self._lock:
                 view = self._view
                 scene = view.scene
-                materials = tuple(self.materials[part] for part in scene.parts)
+                made_of = self._made_of(scene)
                 nodes = view.nodes if size is None else None
             known, kind = view.drafted, wanted if nodes is None else -len(nodes.nodes)
-            if known is None or known.size != kind or known.materials != materials:
+            if known is None or known.size != kind or known.made_of != made_of:
                 if nodes is None:
                     with TURNS.urgent():
-                        known = self._draft(view, materials, wanted)
+                        known = self._draft(view, made_of, wanted)
                 else:
-                    known = self._at_nodes(view, nodes, materials)
+                    known = self._at_nodes(view, nodes, made_of)
                 view.drafted = known
             if view is self._view:  # else it is a picture of what was looked at before
                 return enlarged(known.image, scene.height, scene.width), known.error
@@ -452,42 +464,62 @@ class Viewer:
         while True:
             with self._lock:
                 view = self._view
-                materials = tuple(self.materials[part] for part in view.scene.parts)
+                materials, varying = self._made_of(view.scene)
             start = time.perf_counter()
             with TURNS.urgent():
                 if self._glances is None or self._glances.size != size:
                     self._glances = Glances(self.embedding.grid_, size, self.settings.seed)
                 tree = self._trees.of(view.scene.environment)
-                frame = self._glances.frame(view.scene, *self._tables(materials), tree)
+                tables, mirrors = self._tables(materials)
+
+                def painted(small: Scene) -> Mapping[int, Blend]:
+                    weights = SurfaceWeights(small)
+                    return blends(small, varying, weights, self._table, _FEW)  # noqa: B023
+
+                some = painted if varying else None
+                frame = self._glances.frame(view.scene, tables, mirrors, tree, some)
             view.times["glance"] = time.perf_counter() - start
             if view is self._view:  # else it is a picture of what was looked at before
                 image = enlarged(frame.image, view.scene.height, view.scene.width)
                 return image, frame.error
 
+    def _made_of(self, scene: Scene) -> MadeOf:
+        """Return what the parts of a scene are made of."""
+        return tuple(self.materials[part] for part in scene.parts), self.varying
+
     def _tables(self, materials: Sequence[Material]) -> tuple[list[Float32], list[Float64]]:
         """Return each material's table (cells, 3), decoded once, and weight (3,) of a mirror."""
-        known = self._decoded
-        tables = {m: known[m] if m in known else m.values(self.embedding) for m in materials}
-        self._decoded = tables
-        return [tables[m] for m in materials], [m.mirror for m in materials]
+        return [self._table(m) for m in materials], [m.mirror for m in materials]
 
-    def _at_nodes(
-        self, view: View, nodes: NodeTransport, materials: tuple[Material, ...]
-    ) -> Drafted:
+    def _table(self, material: Material) -> Float32:
+        """Return a material's table (cells, 3), of which the latest are kept."""
+        table = self._decoded.pop(material, None)
+        self._decoded[material] = material.values(self.embedding) if table is None else table
+        while len(self._decoded) > _DECODED:
+            del self._decoded[next(iter(self._decoded))]
+        return self._decoded[material]
+
+    def _at_nodes(self, view: View, nodes: NodeTransport, made_of: MadeOf) -> Drafted:
         start = time.perf_counter()
-        frame = nodes.frame(*self._tables(materials))
+        materials, varying = made_of
+        tables, mirrors = self._tables(materials)
+        some = blends(view.scene, varying, view.surface(), self._table)
+        frame = nodes.frame(tables, mirrors, some)
         view.times["draft"] = time.perf_counter() - start
-        return Drafted(-len(nodes.nodes), materials, *frame)
+        return Drafted(-len(nodes.nodes), made_of, *frame)
 
-    def _draft(self, view: View, materials: tuple[Material, ...], size: int) -> Drafted:
+    def _draft(self, view: View, made_of: MadeOf, size: int) -> Drafted:
         start = time.perf_counter()
         if view.draft is None or view.draft[0] != size:
             tree = self._trees.of(view.scene.environment)
             grid = self.embedding.grid_
             view.draft = size, Draft(view.scene, grid, size, tree=tree, seed=self.settings.seed)
-        image, error = view.draft[1].render(*self._tables(materials))
+        draft, (materials, varying) = view.draft[1], made_of
+        weights = SurfaceWeights(draft.scene)
+        some = blends(draft.scene, varying, weights, self._table, _FEW)
+        image, error = draft.render(*self._tables(materials), some)
         view.times["draft"] = time.perf_counter() - start
-        return Drafted(size, materials, image, error)
+        return Drafted(size, made_of, image, error)
 
     def render(self, wait: bool = True, exact: bool = True) -> Float32:
         """Return the frame: linear radiance, backdrop included, never negative.
@@ -534,14 +566,35 @@ class Viewer:
             return [
                 view.scene.parts[i]
                 for i, one in enumerate(view.shown)
-                if one.tier != "exact" and one.frame.error > self.renderer.allowed(view, i)
+                if one.frame.error > self.renderer.allowed(view, i)
+                and (one.tier != "exact" if one.worst is None else (i, one.worst) not in view.tried)
             ]
 
-    def improve(self) -> bool:
-        """Render one of the `doubtful` parts without the basis, while others edit and draw.
+    @property
+    def unfinished(self) -> bool:
+        """Whether `improve` has something to do: finish local paint, or render `doubtful` parts."""
+        with self._lock:
+            return self._behind() is not None or bool(self.doubtful)
 
-        This takes seconds, in the calling thread. Later frames show what was found, and similar
-        materials by the basis, which learns from it.
+    def _behind(self) -> tuple[str, bool] | None:
+        """Return a part whose local paint is not finished, and whether knots are missing."""
+        local, parts = self._view.local, self.scene.parts
+        if local is None or self.settings.fps is not None:
+            return None
+        varying = self.varying
+        for name in varying:
+            if local.rough(parts.index(name)):
+                return name, True
+        for name, one in varying.items():
+            if local.uncorrected(parts.index(name), one):
+                return name, False
+        return None
+
+    def improve(self) -> bool:
+        """Finish what is painted locally, or render one of the `doubtful` parts without the basis.
+
+        This takes seconds, in the calling thread, while others edit and draw. Later frames show
+        what was found, and similar materials by the basis, which learns from it.
 
         Returns
         -------
@@ -554,16 +607,24 @@ class Viewer:
             if transport is None:
                 return False
             self._frame(view, transport, exact=False)  # what is doubtful among present materials
-            if not self.doubtful:
-                return False
-            name = self.doubtful[0]
-            index, material = view.scene.parts.index(name), self.materials[name]
             renderer, owner, cancels = self.renderer, object(), self._cancels
+            behind = self._behind()
+            if behind is not None:
+                name = behind[0]
+            elif self.doubtful:
+                name = self.doubtful[0]
+            else:
+                return False
+            index = view.scene.parts.index(name)
+            worst = view.shown[index].worst
+            material = self.materials[name] if worst is None else worst
+            made_of = self.materials[name], self.varying.get(name)
 
         def outdated() -> bool:
             if self._cancels != cancels:
                 return True
-            return self._view is not view or self.materials[name] != material
+            present = self.materials[name], self.varying.get(name)
+            return self._view is not view or present != made_of
 
         def told(stage: str, fraction: float) -> None:
             TURNS.give(owner)  # drafts and frames that somebody waits for go first
@@ -572,6 +633,10 @@ class Viewer:
         start = time.perf_counter()
         try:
             TURNS.take(owner, False, outdated)
+            if behind is not None:
+                finish = self._finish if behind[1] else self._correct
+                finish(view, transport, name, told)
+                return True
             found = renderer.exact(view, transport, index, material, told)
         except StoppedError:
             return self._cancels == cancels
@@ -580,8 +645,43 @@ class Viewer:
         with self._lock:
             if self._serving(view) is transport:
                 renderer.take(view, transport, index, found)
-                view.keep(index, material, Shown(found.frame, "exact", time.perf_counter() - start))
+                seconds = time.perf_counter() - start
+                if worst is None:
+                    view.keep(index, material, Shown(found.frame, "exact", seconds))
+                else:
+                    view.tried.add((index, worst))
         return True
+
+    def _correct(self, view: View, transport: Transport, name: str, told: Progress) -> None:
+        """Correct what the basis shows of a locally painted part."""
+        index = view.scene.parts.index(name)
+        with self._lock:
+            varying, local = self.varying.get(name), view.local
+            if varying is None or local is None or not local.current:
+                return
+            wanted = local.uncorrected(index, varying)
+        if wanted:
+            found = local.exact(index, varying, wanted, told)
+            with self._lock:
+                if view.local is local and local.current and self.varying.get(name) is varying:
+                    local.correct(index, varying, found)
+
+    def _finish(self, view: View, transport: Transport, name: str, told: Progress) -> None:
+        """Compute what the finished frame of a locally painted part needs, a little at a time."""
+        index = view.scene.parts.index(name)
+        knots: list[tuple[int, ...]] | None = None
+        while knots is None or knots:
+            told("painting", 0.0)
+            with self._lock:
+                varying, local = self.varying.get(name), view.local
+                if varying is None or local is None or self._serving(view) is not transport:
+                    return
+                if knots is None:
+                    knots = local.lacking(index, varying)
+                some, knots = knots[:_LEARNT], knots[_LEARNT:]
+                local.learn(index, varying, some)
+                if not knots:
+                    local.finish(index, varying)
 
     @property
     def frame_error(self) -> float | None:
@@ -657,7 +757,7 @@ class Viewer:
 
     def _frame(self, view: View, transport: Transport, exact: bool = True) -> Float32:
         materials = [self.materials[part] for part in view.scene.parts]
-        return self.renderer.frame(view, transport, materials, exact)
+        return self.renderer.frame(view, transport, materials, exact, self.varying)
 
     # -- gradients ------------------------------------------------------------------------------
 

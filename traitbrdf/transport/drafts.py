@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.blends import Blend, has_mirrors, mirror_weights
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import Operator as Operator
 from traitbrdf.transport.visibility import Progress as Progress
@@ -58,7 +59,10 @@ class Draft:
         self._rows = exact.rows(self._probes)
 
     def render(
-        self, tables: Sequence[Float32], mirrors: Sequence[Float64] | None = None
+        self,
+        tables: Sequence[Float32],
+        mirrors: Sequence[Float64] | None = None,
+        blends: Mapping[int, Blend] | None = None,
     ) -> tuple[Float32, float]:
         """Render the small frame.
 
@@ -66,6 +70,8 @@ class Draft:
         ----------
         tables : (grid.size, 3) float32 of each part, f_r in 1/sr
         mirrors : (3,) of each part, weights of a perfect mirror, or None
+        blends : mapping of part to Blend, or None
+            Fragments of the small scene that have other materials.
 
         Returns
         -------
@@ -78,14 +84,22 @@ class Draft:
         exact = np.zeros((len(self._probes), 3))
         for part, table in enumerate(tables):
             span = scene.part_slice(part)
-            images = self.operator.part_images(part, table)
-            radiance[span] = np.einsum("pcc->pc", images)
+            blend = None if blends is None else blends.get(part)
+            several = [table, *(() if blend is None else blend.tables)]
+            images = self.operator.part_images(part, np.concatenate(several, axis=1))
+            shown = np.einsum("pckc->pkc", images.reshape(len(images), 3, len(several), 3))
+            radiance[span] = shown[:, 0]
+            if blend is not None:
+                radiance[span][blend.at] = blend.sums(shown[blend.at, 1:])
             mine = (self._probes >= span.start) & (self._probes < span.stop)
             exact[mine] = np.einsum("mck,kc->mc", self._rows[mine], table)
+            if blend is not None:  # of other materials than the rows were told
+                other = np.isin(self._probes - span.start, blend.at) & mine
+                exact[other] = radiance[self._probes[other]]
         level = float(exact.mean()) if exact.size else 0.0
         deviation = np.abs(radiance[self._probes] - exact).mean() if exact.size else 0.0
-        if mirrors is not None and any(np.any(m) for m in mirrors):
-            weight = np.stack([np.asarray(m) for m in mirrors])[scene.pixel_part]
+        if mirrors is not None and has_mirrors(mirrors, blends):
+            weight = mirror_weights(scene, mirrors, blends)
             radiance += weight * self.operator.mirror(np.arange(len(scene.pixels)))
         image = scene.backdrop().reshape(-1, 3) * scene.uncovered[:, None]
         np.add.at(image, scene.pixels, radiance)

@@ -8,9 +8,9 @@ leaving one out would show. Under a light that turns, the interpolation stays as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.blends import Blend, has_mirrors, mirror_weights
 from traitbrdf.transport.interpolation import interpolate_nodes, kriging
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.nodes import NodeFrame
@@ -58,6 +59,9 @@ _NORMAL = 2.2
 
 _APART = 100.0
 """How far parts lie from each other: far more than any two fragments of one part."""
+
+
+Blends: TypeAlias = Callable[[Scene], Mapping[int, Blend]]
 
 
 class _Nodes(NamedTuple):
@@ -104,6 +108,7 @@ class Glances:
         tables: Sequence[Float32],
         mirrors: Sequence[Float64] | None = None,
         tree: LightTree | None = None,
+        blends: Blends | None = None,
     ) -> NodeFrame:
         """Render a small frame (h, w, 3), and measure its error.
 
@@ -117,12 +122,15 @@ class Glances:
             Weight of a perfect mirror beside each table.
         tree : LightTree or None
             The tree of the scene's map, if it was built before.
+        blends : callable or None
+            Returns the fragments of the small scene that have other materials, by part. The error
+            is measured without them.
         """
         if self._nodes is None or self._scene is None or self._scene.shape is not scene.shape:
             self._nodes = None
             self._frame(scene, tables, None, tree)  # it tells where nodes are needed
             self._of = None
-        return self._frame(scene, tables, mirrors, tree)
+        return self._frame(scene, tables, mirrors, tree, blends)
 
     def _frame(
         self,
@@ -130,6 +138,7 @@ class Glances:
         tables: Sequence[Float32],
         mirrors: Sequence[Float64] | None,
         tree: LightTree | None,
+        blends: Blends | None = None,
     ) -> NodeFrame:
         # the distinct tables, and which parts are made of each
         distinct = {id(table): table for table in tables}.values()
@@ -170,11 +179,37 @@ class Glances:
                 part, shown, nodes.near[every], nodes.weights[every], columns[every], slopes
             )
             radiance[every] = part
-        deviation, level = float(np.abs(radiance[probes] - exact).sum()), float(exact.sum())
+        measured = radiance[probes]
+        others = blends(small) if blends is not None else {}
+        for index, blend in others.items():
+            every = small.part_slice(index).start + blend.at
+            mine = np.flatnonzero(small.pixel_part[nodes.at] == index)
+            if not len(mine):
+                continue
+            images = operator.images(
+                nodes.at[mine], np.concatenate(blend.tables, axis=1), operator.core
+            )
+            images /= small.weights[nodes.at[mine], None, None].astype(np.float32)
+            under = np.einsum("pckc->kpc", images.reshape(len(mine), 3, len(blend.tables), 3))
+            own = np.isin(known[mine], mine)
+            order = np.where(own, np.searchsorted(mine, known[mine]), 0)
+            equations = Regression.of(columns[nodes.at[mine]], order, weights[mine] * own)
+            at_nodes = np.zeros_like(shown)
+            mixed = np.zeros((len(every), len(blend.tables), 3), np.float32)
+            for k, one in enumerate(under):
+                slopes = equations.slopes(one)
+                at_nodes[mine] = one - np.einsum("ncd,cd->nc", columns[nodes.at[mine]], slopes)
+                part = np.empty((len(every), 3), np.float32)
+                interpolate_nodes(
+                    part, at_nodes, nodes.near[every], nodes.weights[every], columns[every], slopes
+                )
+                mixed[:, k] = part
+            radiance[every] = blend.sums(mixed)
+        deviation, level = float(np.abs(measured - exact).sum()), float(exact.sum())
         left_out = np.einsum("nk,nkc->nc", weights, shown[known])
         self._nodes = nodes._replace(error=np.abs(left_out - shown).mean(axis=1))
-        if mirrors is not None and any(np.any(m) for m in mirrors):
-            weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[small.pixel_part]
+        if mirrors is not None and has_mirrors(mirrors, others):
+            weight = mirror_weights(small, mirrors, others)
             radiance = radiance + weight * operator.mirror(np.arange(count))
         # with one sample a pixel, no pixel has two fragments
         picture[small.pixels] += radiance * small.weights[:, None].astype(np.float32)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from traitbrdf.directions import reflect
 from traitbrdf.scene.scene import Scene
+from traitbrdf.transport.blends import Blend, has_mirrors, mirror_weights
 from traitbrdf.transport.interpolation import interpolate_nodes, kriging
 from traitbrdf.transport.lighttree import LightTree
 from traitbrdf.transport.operator import Operator
@@ -220,7 +221,10 @@ class NodeTransport:
         return np.concatenate([part.at for part in self.parts])
 
     def frame(
-        self, tables: Sequence[Float32], mirrors: Sequence[Float64] | None = None
+        self,
+        tables: Sequence[Float32],
+        mirrors: Sequence[Float64] | None = None,
+        blends: Mapping[int, Blend] | None = None,
     ) -> NodeFrame:
         """Compute a frame.
 
@@ -230,6 +234,8 @@ class NodeTransport:
             f_r in 1/sr.
         mirrors : sequence of (3,) or None
             Weight of a perfect mirror beside each table.
+        blends : mapping of part to Blend, or None
+            Fragments of parts that have other materials. The error is measured without them.
         """
         scene = self.scene
         deviation = level = 0.0
@@ -249,18 +255,39 @@ class NodeTransport:
                 known = self._draw(part, table, values[part - group.start], slopes)
                 self._drawn[part] = known
             # another thread may draw other materials meanwhile: this frame has its own
-            pieces.append(known.radiance)
+            blend = None if blends is None else blends.get(part)
+            pieces.append(known.radiance if blend is None else self._blended(part, known, blend))
             deviation += known.deviation
             level += known.level
         radiance = torch.from_numpy(np.concatenate(pieces))
-        if mirrors is not None and any(np.any(m) for m in mirrors):
+        if mirrors is not None and has_mirrors(mirrors, blends):
             if self._mirror is None:
                 self._mirror = torch.from_numpy(self.operator.mirror(np.arange(len(radiance))))
-            weight = np.stack([np.asarray(m, np.float32) for m in mirrors])[scene.pixel_part]
+            weight = mirror_weights(scene, mirrors, blends)
             radiance += torch.from_numpy(weight) * self._mirror
         image = self._backdrop.clone().index_add_(0, self._pixels, radiance)
         frame = image.reshape(scene.height, scene.width, 3).numpy()
         return NodeFrame(frame, deviation / level if level > 0.0 else deviation)
+
+    def _blended(self, part: int, drawn: _Drawn, blend: Blend) -> Float32:
+        """Return the radiance (P, 3) of a part some fragments of which have other materials."""
+        span, nodes = self.scene.part_slice(part), self.parts[part]
+        group = self._groups[int(part >= len(self.scene.shape.parts))]
+        shown = np.zeros((len(blend.at), 3), np.float32)
+        for corner, table in enumerate(blend.tables):
+            point, share = blend.of(corner)
+            at = blend.at[point]
+            values, slopes = self._at_nodes(table, group)
+            columns = self._columns[span]
+            rest = values[part - group.start] - np.einsum(
+                "ncd,cd->nc", self._columns[nodes.at], slopes
+            )
+            found = np.empty((len(at), 3), np.float32)
+            interpolate_nodes(found, rest, nodes.near[at], nodes.weights[at], columns[at], slopes)
+            shown[point] += share[:, None] * found
+        radiance = drawn.radiance.copy()
+        radiance[blend.at] = shown * self._covered[span][blend.at]
+        return radiance
 
     def _draw(self, part: int, table: Float32, shown: Float32, slopes: Float32) -> _Drawn:
         """Interpolate a part from its nodes (n, 3), and measure its error."""

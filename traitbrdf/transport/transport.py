@@ -51,6 +51,7 @@ from traitbrdf.scene.scene import Scene
 from traitbrdf.transport.basis import (
     TOP,
     Basis,
+    PartFrame,
     Training,
     damping_of,
     extended,
@@ -90,27 +91,6 @@ class _Part:
     mirror: torch.Tensor
     probes: torch.Tensor
     exact: slice
-
-
-@dataclass(frozen=True)
-class PartFrame:
-    """One part shaded with one table, and its measured error.
-
-    Attributes
-    ----------
-    radiance : (P, 3) tensor, linear radiance of the part's fragments
-    deviation : float, mean |I - I_exact| over the part's probes
-    level : float, mean I_exact over the part's probes
-    """
-
-    radiance: torch.Tensor
-    deviation: float
-    level: float
-
-    @property
-    def error(self) -> float:
-        """Mean relative L1 of the part; the deviation itself where the level is 0."""
-        return self.deviation / self.level if self.level > 0.0 else self.deviation
 
 
 class Transport:
@@ -484,10 +464,20 @@ class Transport:
         ]
         return np.sort(np.concatenate(chosen))
 
+    def exact_rows(self, fragments: Int64) -> Float32:
+        """Compute rows of W as exactly as those of the probes: (m, 3, grid.size) float32.
+
+        Parameters
+        ----------
+        fragments : (m,) int64
+            Distinct fragments of the scene.
+        """
+        return self._exact.rows(fragments)
+
     def _probe_rows(self, probes: Int64) -> Float32:
         """Compute the exact rows (C, m, cells) of fragments (C, m), each in one colour."""
         distinct, where = np.unique(probes, return_inverse=True)
-        rows = self._exact.rows(distinct)
+        rows = self.exact_rows(distinct)
         return np.stack([rows[at, c] for c, at in enumerate(where.reshape(probes.shape))])
 
     def _combinations(
