@@ -29,6 +29,10 @@ FRAMES_KEPT = 1 << 27
 """Bytes of finished parts that are kept, so that what is undone is shown again as it was."""
 
 
+MOST_TRIED = 4
+"""Most materials of a locally painted part whose exact images are added to its basis."""
+
+
 @dataclass(frozen=True)
 class Shown:
     """One part's shading as it is shown.
@@ -91,6 +95,18 @@ class View:
     weights: SurfaceWeights | None = None
     local: LocalFrames | None = None
     times: dict[str, float] = field(default_factory=dict)
+
+    def untried(self, index: int, worst: Material) -> bool:
+        """Return whether an exact image of a locally painted part's worst material may still help.
+
+        Parameters
+        ----------
+        index : int
+            Index of the part.
+        worst : Material
+        """
+        mine = {material for part, material in self.tried if part == index}
+        return worst not in mine and len(mine) < MOST_TRIED
 
     def surface(self) -> SurfaceWeights:
         """Return what computes the weights of local masks."""

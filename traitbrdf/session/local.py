@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -546,10 +546,24 @@ class LocalFrames:
         most = sorted(found, key=lambda key: -len(found[key]))[:_CORNERS]
         return {key: found[key] for key in most}
 
+    def halves(self, varying: Varying, corners: Iterable[tuple[int, ...]]) -> list[Material]:
+        """Return the materials at corners, as `uncorrected` names these.
+
+        Parameters
+        ----------
+        varying : Varying
+        corners : amounts in units of half the opacity
+        """
+        scale = [layer.strength / _HALVES for layer in varying.local]
+        return [
+            varying.material([s * c for s, c in zip(scale, corner, strict=True)])
+            for corner in corners
+        ]
+
     def exact(
         self,
         part: int,
-        varying: Varying,
+        materials: Sequence[Material],
         wanted: Mapping[tuple[int, ...], Int64],
         told: Progress,
     ) -> dict[tuple[int, ...], tuple[Int64, Float32]]:
@@ -559,16 +573,12 @@ class LocalFrames:
         ----------
         part : int
             Index of the part.
-        varying : Varying
+        materials : sequence of Material
+            What `halves` made of `wanted`.
         wanted : what `uncorrected` returned
         told : called with (stage, fraction done); may raise to cancel
         """
         transport = self.transport
-        scale = [layer.strength for layer in varying.local]
-        materials = [
-            varying.material([s * c / _HALVES for s, c in zip(scale, corner, strict=True)])
-            for corner in wanted
-        ]
         tables = [m.values(self.embedding) for m in materials]
         several = np.concatenate(tables, axis=1)
         index = np.unique(np.concatenate([*wanted.values()]))
@@ -582,7 +592,8 @@ class LocalFrames:
         found = {}
         for k, (corner, at) in enumerate(wanted.items()):
             seen = torch.from_numpy(tables[k][transport.cells]).to(transport.device)
-            basis = transport.shade(part, seen).radiance.cpu().numpy()
+            # alone: the product that frames share belongs to other threads
+            basis = transport.shade(part, seen, alone=True).radiance.cpu().numpy()
             found[corner] = at, exact[np.searchsorted(index, at), k] - basis[at]
         return found
 

@@ -168,7 +168,7 @@ class Renderer:
                 break
             # an exact image of what is shown worst makes the basis show it better
             worst = known.worst(index, varying)
-            if not exact or (index, worst) in view.tried:
+            if not exact or not view.untried(index, worst):
                 break
             view.tried.add((index, worst))
             self._exactly(view, transport, index, worst)

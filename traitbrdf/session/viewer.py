@@ -567,7 +567,7 @@ class Viewer:
                 view.scene.parts[i]
                 for i, one in enumerate(view.shown)
                 if one.frame.error > self.renderer.allowed(view, i)
-                and (one.tier != "exact" if one.worst is None else (i, one.worst) not in view.tried)
+                and (one.tier != "exact" if one.worst is None else view.untried(i, one.worst))
             ]
 
     @property
@@ -660,8 +660,9 @@ class Viewer:
             if varying is None or local is None or not local.current:
                 return
             wanted = local.uncorrected(index, varying)
+            materials = local.halves(varying, wanted)
         if wanted:
-            found = local.exact(index, varying, wanted, told)
+            found = local.exact(index, materials, wanted, told)
             with self._lock:
                 if view.local is local and local.current and self.varying.get(name) is varying:
                     local.correct(index, varying, found)
