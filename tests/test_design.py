@@ -158,6 +158,8 @@ EXAMPLES: dict[str, Effect] = {
     "Move": Move(shiny=0.4),
     "Parameters": tb.Parameters("GGX", alpha=0.3),
     "Tint": Tint((1.0, 0.2, 0.1)),
+    "Colour": tb.Colour("#b03030"),
+    "Highlight": tb.Highlight(blur=2.0),
 }
 
 

@@ -43,7 +43,7 @@ FINEST = 16
 FEWEST = 4
 """Fewest steps of a layer that is not measured, or that lies below others whose rims cross it."""
 
-MOST_KNOTS = (27, 256)
+MOST_KNOTS = (27, 320)
 """Most knots where rims of several layers cross: in live frames, and in finished ones."""
 
 _STRAIGHT = 1e-4
@@ -331,7 +331,6 @@ class LocalFrames:
             fresh = self._paints[key] = _Paint(varying, scale)
             if below is not None and below.values is not None and below.scale == scale[:-1]:
                 # under a layer on top that is not there, all is as it was
-                fresh.steps = dict(below.steps)
                 fresh.corrections = {(*key, 0): known for key, known in below.corrections.items()}
                 fresh.add([(*key, 0) for key in below.place], below.values[: len(below.place)])
             if len(self._paints) > 6 * len(self.transport.parts):
@@ -391,31 +390,34 @@ class LocalFrames:
         return [*(max(step, FEWEST) for step in steps[:-1]), *steps[-1:]]
 
     def _steps(self, part: int, paint: _Paint, axis: int, measure: bool = True) -> int:
-        """Return how many steps between knots a layer needs.
-
-        That is measured where no other layer is painted; `FEWEST` as long as it is not.
-        """
+        """Return how many steps between knots a layer needs; `FEWEST` until that is measured."""
         if axis in paint.steps or not measure:
             return paint.steps.get(axis, FEWEST)
-        count, axes, steps = len(paint.varying.local), np.array([axis]), 1
-        while steps < FINEST:
-            places = np.zeros((count, 3), np.float32)
-            half = 0.5 / steps
-            places[axis] = (0.25, 0.5, 0.75) if steps == 1 else (half, 0.5 + half, 1.0 - half)
-            stencil = _Stencil.of(places, axes, [steps])
-            known = self._at_knots(part, paint, stencil.keys)
-            keys = [tuple(key) for key in np.rint(FINEST * places.T).astype(int).tolist()]
-            rows = self._at_knots(part, paint, keys)
-            found = stencil.sums(paint, known, slice(None))
-            assert paint.values is not None
-            exact = paint.values[torch.from_numpy(rows).to(found.device)]
-            off = self._on_probes(part, found - exact).abs().mean(dim=(1, 2))
-            error = float((off / exact[:, -1].clamp_min(1e-30)).max())
-            if error <= (_STRAIGHT if steps == 1 else _SMOOTH):
-                break
-            steps = max(2 * steps, FEWEST)
+        steps = 1
+        # without the other layers, and with all of them: what lies above may bend the way
+        for others in (0.0, 1.0) if len(paint.varying.local) > 1 else (0.0,):
+            while steps < FINEST:
+                error = self._bend(part, paint, axis, steps, others)
+                if error <= (_STRAIGHT if steps == 1 else _SMOOTH):
+                    break
+                steps = max(2 * steps, FEWEST)
         paint.steps[axis] = steps
         return steps
+
+    def _bend(self, part: int, paint: _Paint, axis: int, steps: int, others: float) -> float:
+        """Return the greatest relative error of responses between knots along one layer."""
+        places = np.full((len(paint.varying.local), 3), others, np.float32)
+        half = 0.5 / steps
+        places[axis] = (0.25, 0.5, 0.75) if steps == 1 else (half, 0.5 + half, 1.0 - half)
+        stencil = _Stencil.of(places, np.array([axis]), [steps])
+        known = self._at_knots(part, paint, stencil.keys)
+        keys = [tuple(key) for key in np.rint(FINEST * places.T).astype(int).tolist()]
+        rows = self._at_knots(part, paint, keys)
+        found = stencil.sums(paint, known, slice(None))
+        assert paint.values is not None
+        exact = paint.values[torch.from_numpy(rows).to(found.device)]
+        off = self._on_probes(part, found - exact).abs().mean(dim=(1, 2))
+        return float((off / exact[:, -1].clamp_min(1e-30)).max())
 
     def _on_probes(self, part: int, responses: torch.Tensor) -> torch.Tensor:
         """Return what the basis shows at a part's probes: (K, 3, m)."""
