@@ -170,7 +170,7 @@ def test_random_sessions_replay_to_the_same_frame(prepared, tmp_path):
 
 @pytest.mark.slow
 def test_many_long_random_sessions_replay_to_the_same_frame(prepared, tmp_path):
-    run(prepared, tmp_path, 20, 25)
+    run(prepared, tmp_path, 10, 20)
 
 
 # -- files ----------------------------------------------------------------------------------------
