@@ -124,6 +124,22 @@ def test_blur_widens_and_intensity_scales_as_asked(name, factor):
         np.testing.assert_allclose(faint[peak], factor * before[peak], rtol=0.1)
 
 
+@pytest.mark.parametrize("name", ["black-velvet", "red-velvet", "red-rubber", "gold-polished"])
+@pytest.mark.parametrize("factor", [0.5, 2.0, 4.0, 20.0])
+def test_blur_keeps_energy_and_rims(name, factor):
+    """Reflections near theta_h = 90 degrees left the hemisphere when they were stretched from 0."""
+    material = Material.of_library(name, LIBRARY)
+    before = table(material)
+    after = table(tb.Highlight(blur=factor).apply(material, 1.0, PALETTE).material)
+    angles = np.radians(np.linspace(0.0, 80.0, 33))
+    weight = np.cos(angles) * np.sin(angles)
+    one, two = (weight @ t.albedo(angles).mean(axis=1) / weight.sum() for t in (before, after))
+    assert two == pytest.approx(one, rel=0.15)
+    assert after.albedo(angles).max() <= max(before.albedo(angles).max(), 1.0) + 1e-3
+    if "velvet" in name:  # brightest at the rim before and after
+        assert np.diff(after.albedo(angles).mean(axis=1))[16:].min() > 0.0
+
+
 @pytest.mark.parametrize(("at", "width"), [(0.0, 6.0), (20.0, 8.0), (40.0, 12.0)])
 def test_a_created_lobe_stands_where_and_as_wide_as_asked(at, width):
     matte = Material.of_reflectance(tb.models.Lambert(0.2), EMBEDDING)

@@ -300,9 +300,7 @@ def _highlit(effect: Highlight, material: Material, embedding: BRDFEmbedding) ->
     rest = values - body
     mirror = material.mirror
     if effect.blur != 1.0:
-        blurred = _stretched(rest, grid, effect.blur)
-        before, after = (float(_mean_albedo(v, grid).sum()) for v in (rest, blurred))
-        rest = np.asarray(blurred * (before / max(after, 1e-12)), np.float32)
+        rest = _blurred(rest, grid, effect.blur)
     if effect.intensity != 1.0:
         rest = np.asarray(rest * effect.intensity, np.float32)
         mirror = np.minimum(mirror * effect.intensity, 1.0)
@@ -323,16 +321,35 @@ def _fitting(below: Float32, added: Float32) -> float:
     return float((room[over] / added[over]).min()) if over.any() else 1.0
 
 
-def _stretched(values: Float32, grid: HalfDiffGrid, factor: float) -> Float32:
-    """Return a table (cells, 3) stretched along theta_h by a factor."""
-    source = grid.theta_h / factor
-    place = np.interp(source, grid.theta_h, np.arange(len(grid.theta_h)))
+def _blurred(values: Float32, grid: HalfDiffGrid, factor: float) -> Float32:
+    """Return reflections (cells, 3) that are wider by a factor and keep their energy.
+
+    What falls with theta_h is stretched from the mirror direction, and what rises again, such as
+    the rim of velvet, from 90 degrees: stretched from 0 it would leave the hemisphere.
+    """
+    table = values.reshape(len(grid.theta_h), -1, 3)
+    falling = np.minimum.accumulate(table, axis=0)
+    out = np.zeros_like(table)
+    for part, centre, power in ((falling, 0.0, 2), (table - falling, grid.theta_h[-1], 1)):
+        wide = _stretched(part, grid.theta_h, centre, factor)
+        before, after = (float(_mean_albedo(v.reshape(-1, 3), grid).sum()) for v in (part, wide))
+        # a lobe's solid angle goes with factor^2, a rim's with factor; where more is lost than
+        # that, as at the end of the hemisphere, a share stays as it is
+        gain = min(before / max(after, 1e-12), max(1.0, 2.0 / factor**power))
+        stays = max(1.0 - gain * after / max(before, 1e-12), 0.0)
+        out += gain * wide + stays * part
+    return np.asarray(out.reshape(-1, 3), np.float32)
+
+
+def _stretched(table: Float32, theta_h: Float64, centre: float, factor: float) -> Float32:
+    """Return a table (theta_h, ..., 3) stretched along theta_h around an angle."""
+    source = centre + (theta_h - centre) / factor
+    place = np.interp(source, theta_h, np.arange(len(theta_h)))
     low = np.minimum(place.astype(np.int64), len(place) - 2)
     share = (place - low).astype(np.float32)[:, None, None]
-    table = values.reshape(len(place), -1, 3)
     found = (1.0 - share) * table[low] + share * table[low + 1]
-    found[source > grid.theta_h[-1]] = 0.0
-    return np.asarray(found.reshape(-1, 3), np.float32)
+    found[(source < 0.0) | (source > theta_h[-1])] = 0.0
+    return np.asarray(found, np.float32)
 
 
 for _kind in (Colour, Highlight):
