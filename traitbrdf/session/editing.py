@@ -49,7 +49,7 @@ from traitbrdf.transport.visibility import Progress
 Float32 = NDArray[np.float32]
 _FIRST_MATERIAL = "white-plastic"
 _FIRST_GROUND = "concrete"
-_MEASURED = 96  # fragments at which the error of local paint is measured
+_MEASURED = 256  # fragments at which the error of local paint is measured; few err much
 
 
 class EditSession(Viewer):

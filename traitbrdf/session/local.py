@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -37,11 +37,15 @@ from traitbrdf.transport.visibility import Progress
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
-FINEST = 16
+FINEST = 32
 """Most steps between knots of a layer, at which effects are applied."""
 
 FEWEST = 4
 """Fewest steps of a layer that is not measured, or that lies below others whose rims cross it."""
+
+_ROOT = 3
+"""Knots of layers below others are uniform in this root of the weight, of which mixtures are cubic
+polynomials: what a move on top does may change within the first hundredths of the weight."""
 
 MOST_KNOTS = (27, 320)
 """Most knots where rims of several layers cross: in live frames, and in finished ones."""
@@ -108,6 +112,10 @@ def fewer(steps: Sequence[int], most: int) -> list[int]:
     return found
 
 
+_Axis: TypeAlias = tuple[int, bool]
+"""A layer's place among the local ones, and whether others are above it at some fragments."""
+
+
 @dataclass(eq=False)
 class _Paint:
     """What is known of one part's layers under one basis.
@@ -116,20 +124,47 @@ class _Paint:
     ----------
     varying : Varying, which keeps alive what it is known by
     scale : amount of each local layer at its last knot
-    steps : dict, knots less one that a layer needs, by its place among the local ones
+    steps : dict, knots less one that a layer needs, by its axis and whether it is below others
     corrections : dict, (P, 3) by amounts in units of scale / _HALVES
         What exact images differ by from those of the basis; NaN where that is not known.
-    place : dict, row of `values` by amounts in units of scale / FINEST
+    place : dict, row of `values` by knot (see `amounts`)
     values : (n, 3 r + 5) tensor or None
         Coefficients, mirror, deviation and level at each of the knots; there is room for more.
     """
 
     varying: Varying
     scale: tuple[float, ...]
-    steps: dict[int, int] = field(default_factory=dict)
+    steps: dict[_Axis, int] = field(default_factory=dict)
     corrections: dict[tuple[int, ...], Float32] = field(default_factory=dict)
     place: dict[tuple[int, ...], int] = field(default_factory=dict)
     values: torch.Tensor | None = None
+
+    def amounts(self, key: Sequence[int]) -> list[float]:
+        """Return the amount of each layer at a knot.
+
+        It is i / FINEST of the layer's scale for i to FINEST, and ((i - FINEST) / FINEST)^_ROOT of
+        it above that.
+        """
+        shares = [i / FINEST if i <= FINEST else (i / FINEST - 1.0) ** _ROOT for i in key]
+        return [scale * share for scale, share in zip(self.scale, shares, strict=True)]
+
+    def groups(self, amounts: Float32) -> Iterator[tuple[Int64, list[_Axis], Float32]]:
+        """Divide fragments with amounts (n, m) by the layers whose rims they are at.
+
+        Yields, for each group, its fragments, the layers with rims there, and where these are
+        between their first and their last knot (n, m): in [0, 1], roots for layers below others.
+        """
+        places = amounts / np.array(self.scale, np.float32)[:, None]
+        rims = (places > 0.0) & (places < 1.0)
+        above = np.zeros_like(rims)
+        above[:-1] = np.logical_or.accumulate(amounts[:0:-1] > 0.0, axis=0)[::-1]
+        lower = rims & above
+        places[lower] **= np.float32(1.0 / _ROOT)
+        patterns, code = _patterns(np.concatenate([rims, lower]))
+        for one, pattern in enumerate(patterns):
+            at = np.flatnonzero(code == one)
+            rim, root = np.split(pattern, 2)
+            yield at, [(int(k), bool(root[k])) for k in np.flatnonzero(rim)], places[:, at]
 
     def add(self, keys: Sequence[tuple[int, ...]], values: torch.Tensor) -> None:
         """Add rows."""
@@ -149,7 +184,7 @@ class _Stencil:
     Attributes
     ----------
     keys : sequence of tuples
-        Amounts of the knots that are used, in units of 1 / FINEST.
+        The knots that are used; see `_Paint.amounts`.
     knot : (m, s) int64
         The knots of each fragment among these.
     weight : (m, s) float32
@@ -160,26 +195,26 @@ class _Stencil:
     weight: Float32
 
     @classmethod
-    def of(cls, amounts: Float32, axes: Int64, steps: Sequence[int]) -> _Stencil:
-        """Find the knots of amounts (n, m) that differ along some axes.
+    def of(cls, places: Float32, layers: Sequence[_Axis], steps: Sequence[int]) -> _Stencil:
+        """Find the knots of places (n, m) that differ along some axes.
 
         Other layers are there wholly or not at all, which need not be the same everywhere.
         """
-        count = amounts.shape[1]
-        fixed = np.delete(np.arange(len(amounts)), axes)
-        whole, group = _patterns(amounts[fixed] > 0.0)
+        count, axes = places.shape[1], [axis for axis, _ in layers]
+        fixed = np.delete(np.arange(len(places)), axes)
+        whole, group = _patterns(places[fixed] > 0.0)
         code, weight = group[:, None], np.ones((count, 1), np.float32)
         for axis, step in zip(axes, steps, strict=True):
-            at, share = lagrange(amounts[axis].astype(np.float64) * step, step)
+            at, share = lagrange(places[axis].astype(np.float64) * step, step)
             code = (code[:, :, None] * (step + 1) + at[:, None, :]).reshape(count, -1)
             weight = (weight[:, :, None] * share[:, None, :].astype(np.float32)).reshape(count, -1)
         size = math.prod(step + 1 for step in steps)
         used = np.flatnonzero(np.bincount(code.ravel(), minlength=len(whole) * size))
-        keys = np.empty((len(used), len(amounts)), np.int64)
+        keys = np.empty((len(used), len(places)), np.int64)
         keys[:, fixed] = FINEST * whole[used // size]
         rest = used % size
-        for axis, step in zip(axes[::-1], steps[::-1], strict=True):
-            keys[:, axis] = rest % (step + 1) * (FINEST // step)
+        for layer, step in zip(layers[::-1], steps[::-1], strict=True):
+            keys[:, layer[0]] = _knots(rest % (step + 1) * (FINEST // step), layer)
             rest = rest // (step + 1)
         place = np.zeros(len(whole) * size, np.int64)
         place[used] = np.arange(len(used))
@@ -264,8 +299,8 @@ class LocalFrames:
         painted = np.asarray((amounts > 0.0).any(axis=0))
         before = None if state is None or state.base is not base else self._carried(state, paint)
         if state is not None and before is not None:
-            layers = max(len(before), len(amounts))
-            fresh = (_padded(amounts, layers) != _padded(before, layers)).any(axis=0)
+            most = max(len(before), len(amounts))
+            fresh = (_padded(amounts, most) != _padded(before, most)).any(axis=0)
             if finished:
                 fresh |= state.rough
             if not fresh.any() and state.paint is paint:
@@ -279,23 +314,20 @@ class LocalFrames:
             rough = np.zeros(count, np.bool_)
         bare = np.flatnonzero(fresh & ~painted)
         if len(bare):
-            at = torch.from_numpy(bare).to(radiance.device)
-            radiance[at] = base.radiance[at]
+            gone = torch.from_numpy(bare).to(radiance.device)
+            radiance[gone] = base.radiance[gone]
             errors[bare], rough[bare] = (base.deviation, base.level), False
         some = np.flatnonzero(fresh & painted)
-        places = amounts / np.array(paint.scale, np.float32)[:, None]
-        rims = (places[:, some] > 0.0) & (places[:, some] < 1.0)
-        patterns, code = _patterns(rims)
-        for one, pattern in enumerate(patterns):
-            at = some[code == one]
-            axes = np.flatnonzero(pattern)
-            found = self._shade(part, paint, (places[:, at], at), axes, finished)
+        for own, layers, places in paint.groups(amounts[:, some]):
+            at = some[own]
+            found = self._shade(part, paint, (places, at), layers, finished)
             radiance[torch.from_numpy(at).to(radiance.device)] = found[0]
             errors[at], rough[at] = found[1:]
         if paint.corrections and len(some):
-            at = torch.from_numpy(some).to(radiance.device)
-            more = torch.from_numpy(_correction(paint, places[:, some], some))
-            radiance[at] = (radiance[at] + more.to(radiance.device)).clamp_min_(0.0)
+            where = torch.from_numpy(some).to(radiance.device)
+            shares = amounts[:, some] / np.array(paint.scale, np.float32)[:, None]
+            more = torch.from_numpy(_correction(paint, shares, some))
+            radiance[where] = (radiance[where] + more.to(radiance.device)).clamp_min_(0.0)
         changed = torch.from_numpy(np.flatnonzero(fresh)).to(radiance.device)
         deviation, level = errors.mean(axis=0).tolist()
         frame = PartFrame(radiance, deviation, level, (serial, changed))
@@ -343,7 +375,7 @@ class LocalFrames:
         part: int,
         paint: _Paint,
         where: tuple[Float32, Int64],
-        axes: Int64,
+        layers: list[_Axis],
         finished: bool,
     ) -> tuple[torch.Tensor, Float32, bool]:
         """Shade fragments at the rims of the same layers.
@@ -351,20 +383,20 @@ class LocalFrames:
         Returns their radiance (m, 3), deviation and level (m, 2), and whether there should be more
         knots.
         """
-        (amounts, fragments), transport = where, self.transport
+        (places, fragments), transport = where, self.transport
         known = transport.parts[part]
         assert known is not None
         basis, device = transport.bases[known.group], transport.device
-        rough = not finished and any(int(axis) not in paint.steps for axis in axes)
-        wanted = self._wanted(part, paint, axes, finished)
+        rough = not finished and any(layer not in paint.steps for layer in layers)
+        wanted = self._wanted(part, paint, layers, finished)
         steps = fewer(wanted, MOST_KNOTS[finished])
-        stencil = _Stencil.of(amounts, axes, steps)
+        stencil = _Stencil.of(places, layers, steps)
         while max(steps, default=1) > 1:
             lacking = sum(key not in paint.place for key in stencil.keys)
             if lacking <= self._left:
                 break
             steps = fewer(steps, math.prod(s + 1 for s in steps) - 1)
-            stencil = _Stencil.of(amounts, axes, steps)
+            stencil = _Stencil.of(places, layers, steps)
         shown = torch.empty((len(fragments), 3), device=device)
         errors = torch.empty((len(fragments), 2), device=device)
         rank = basis.rank
@@ -383,35 +415,43 @@ class LocalFrames:
             shown[some], errors[some] = found, mixed[:, -2:]
         return shown, errors.cpu().numpy(), rough or steps != fewer(wanted, MOST_KNOTS[True])
 
-    def _wanted(self, part: int, paint: _Paint, axes: Int64, measure: bool = True) -> list[int]:
+    def _wanted(
+        self, part: int, paint: _Paint, layers: list[_Axis], measure: bool = True
+    ) -> list[int]:
         """Return how many steps layers need whose rims cross."""
-        steps = [self._steps(part, paint, int(axis), measure) for axis in axes]
+        steps = [self._steps(part, paint, layer, measure) for layer in layers]
         # a mixture goes straight, but what lies above it does not
         return [*(max(step, FEWEST) for step in steps[:-1]), *steps[-1:]]
 
-    def _steps(self, part: int, paint: _Paint, axis: int, measure: bool = True) -> int:
+    def _steps(self, part: int, paint: _Paint, layer: _Axis, measure: bool = True) -> int:
         """Return how many steps between knots a layer needs; `FEWEST` until that is measured."""
-        if axis in paint.steps or not measure:
-            return paint.steps.get(axis, FEWEST)
+        if layer in paint.steps or not measure:
+            return paint.steps.get(layer, FEWEST)
         steps = 1
-        # without the other layers, and with all of them: what lies above may bend the way
-        for others in (0.0, 1.0) if len(paint.varying.local) > 1 else (0.0,):
+        # with and without the layers below: they bend the way
+        for others in (0.0, 1.0) if layer[0] > 0 else (0.0,):
             while steps < FINEST:
-                error = self._bend(part, paint, axis, steps, others)
+                error = self._bend(part, paint, layer, steps, others)
                 if error <= (_STRAIGHT if steps == 1 else _SMOOTH):
                     break
                 steps = max(2 * steps, FEWEST)
-        paint.steps[axis] = steps
+        paint.steps[layer] = steps
         return steps
 
-    def _bend(self, part: int, paint: _Paint, axis: int, steps: int, others: float) -> float:
-        """Return the greatest relative error of responses between knots along one layer."""
-        places = np.full((len(paint.varying.local), 3), others, np.float32)
-        half = 0.5 / steps
-        places[axis] = (0.25, 0.5, 0.75) if steps == 1 else (half, 0.5 + half, 1.0 - half)
-        stencil = _Stencil.of(places, np.array([axis]), [steps])
+    def _bend(self, part: int, paint: _Paint, layer: _Axis, steps: int, below: float) -> float:
+        """Return the greatest relative error of responses between knots along one layer.
+
+        Layers above are there wholly, if any are.
+        """
+        axis, above = layer
+        between = (0.25, 0.5, 0.75) if steps == 1 else (np.arange(steps) + 0.5) / steps
+        places = np.full((len(paint.varying.local), len(between)), below, np.float32)
+        places[axis], places[axis + 1 :] = between, float(above)
+        stencil = _Stencil.of(places, [layer], [steps])
         known = self._at_knots(part, paint, stencil.keys)
-        keys = [tuple(key) for key in np.rint(FINEST * places.T).astype(int).tolist()]
+        whole = np.rint(FINEST * places).astype(np.int64)
+        whole[axis] = _knots(whole[axis], layer)
+        keys = [tuple(key) for key in whole.T.tolist()]
         rows = self._at_knots(part, paint, keys)
         found = stencil.sums(paint, known, slice(None))
         assert paint.values is not None
@@ -436,12 +476,7 @@ class LocalFrames:
             lacking.sort()
             self._left -= len(lacking)
             varying = paint.varying
-            materials = [
-                varying.material(
-                    [scale * i / FINEST for scale, i in zip(paint.scale, key, strict=True)]
-                )
-                for key in lacking
-            ]
+            materials = [varying.material(paint.amounts(key)) for key in lacking]
             paint.add(lacking, self._respond(part, materials))
         return np.array([paint.place[key] for key in keys], np.int64)
 
@@ -494,14 +529,10 @@ class LocalFrames:
         """
         amounts, paint = self.amounts(part, varying), self._paint(part, varying, True)
         some = amounts[:, (amounts > 0.0).any(axis=0)]
-        places = some / np.array(paint.scale, np.float32)[:, None]
-        patterns, code = _patterns((places > 0.0) & (places < 1.0))
         wanted: dict[tuple[int, ...], None] = {}
-        for one, pattern in enumerate(patterns):
-            axes = np.flatnonzero(pattern)
-            steps = fewer(self._wanted(part, paint, axes), MOST_KNOTS[True])
-            stencil = _Stencil.of(places[:, code == one], axes, steps)
-            wanted |= dict.fromkeys(stencil.keys)
+        for _, layers, places in paint.groups(some):
+            steps = fewer(self._wanted(part, paint, layers), MOST_KNOTS[True])
+            wanted |= dict.fromkeys(_Stencil.of(places, layers, steps).keys)
         return sorted(key for key in wanted if key not in paint.place)
 
     def learn(self, part: int, varying: Varying, knots: Sequence[tuple[int, ...]]) -> None:
@@ -708,6 +739,12 @@ def _correction(paint: _Paint, places: Float32, fragments: Int64) -> Float32:
             more = shares.share[entries, None] * known[fragments[point]]
             whole[point] += np.nan_to_num(more)
     return whole
+
+
+def _knots(index: Int64, layer: _Axis) -> Int64:
+    """Return entries of knots' keys, of indices from 0 to FINEST along a layer."""
+    inner = (index > 0) & (index < FINEST)
+    return np.where(inner & layer[1], index + FINEST, index)
 
 
 def _patterns(mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Int64]:
