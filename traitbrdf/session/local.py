@@ -65,6 +65,8 @@ DOUBTED = 2.5e-3
 _HALVES = 2
 """Steps along each layer between materials whose exact images correct the basis."""
 
+_NEAR = 0.1  # weights by which a corner may be off the knot that tells its error
+
 _CORNERS = 8  # materials whose exact images are computed together
 
 _KNOWN = 1 << 27
@@ -563,10 +565,13 @@ class LocalFrames:
         shares = Shares.of(amounts[:, at] / np.array(paint.scale, np.float32)[:, None], _HALVES)
         point = np.repeat(at, np.diff(shares.first))
         found: dict[tuple[int, ...], Int64] = {}
+        rows = list(paint.place.values())
+        knots = np.array([paint.amounts(key) for key in paint.place]) / paint.scale
         for k, corner in enumerate(shares.corners):
             key = tuple(corner.tolist())
-            row = paint.place.get(tuple((FINEST // _HALVES * corner).tolist()))
-            if row is None:
+            apart = np.abs(knots - corner / _HALVES).max(axis=1)
+            row = rows[int(apart.argmin())]
+            if apart.min() > _NEAR:
                 continue
             deviation, level = paint.values[row, -2:].tolist()
             if deviation <= DOUBTED * level:
@@ -697,7 +702,7 @@ class LocalFrames:
         Returns
         -------
         error : float
-            Mean |I - I_exact| over mean I_exact, without mirrors.
+            Mean |I - I_exact| over mean I.
         painted : int
             Number of painted fragments.
         """
@@ -707,23 +712,25 @@ class LocalFrames:
             amounts = self.amounts(part, one)
             places.append((part, one, amounts, np.flatnonzero((amounts > 0.0).any(axis=0))))
         total = sum(len(at) for *_, at in places)
-        shown, exact = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        off, level = 0.0, 0.0
         for part, one, amounts, at in places:
-            some = min(math.ceil(count * len(at) / max(total, 1)), len(at))
-            chosen = np.sort(rng.choice(at, some, replace=False)) if some else at[:0]
-            known = self.transport.parts[part]
-            if known is None or not some:
+            known, radiance = self.transport.parts[part], frames[part].radiance
+            if known is None or not len(at):
                 continue
+            # of all fragments: a few bright ones have most of the light
+            everywhere = torch.from_numpy(at).to(self.transport.device)
+            level += float(radiance[everywhere].sum())
+            some = min(math.ceil(count * len(at) / total), len(at))
+            chosen = np.sort(rng.choice(at, some, replace=False))
             rows = self.transport.exact_rows(chosen + scene.part_slice(part).start)
             materials = [one.material(amounts[:, i].tolist()) for i in chosen]
             tables = np.stack([m.values(self.embedding) for m in materials])
-            exact.append(np.einsum("pcn,pnc->pc", rows, tables))
+            exact = np.einsum("pcn,pnc->pc", rows, tables)
             here = torch.from_numpy(chosen).to(self.transport.device)
             mirrors = np.stack([m.mirror for m in materials])
-            mirrored = mirrors * known.mirror[here].cpu().numpy()
-            shown.append(frames[part].radiance[here].cpu().numpy() - mirrored)
-        level = float(np.concatenate(exact).sum())
-        off = float(np.abs(np.concatenate(shown) - np.concatenate(exact)).sum())
+            exact += mirrors * known.mirror[here].cpu().numpy()
+            shown = radiance[here].cpu().numpy()
+            off += float(np.abs(shown - exact).sum()) * len(at) / some
         return (off / level if level > 0.0 else off), total
 
 
