@@ -102,6 +102,21 @@ def file_size(file: BinaryIO) -> int:
     return os.fstat(file.fileno()).st_size
 
 
+def fits_in_memory(needed: int, size: int) -> bool:
+    """Return whether a file may become so many bytes: 128 MiB, or 20 times its own size.
+
+    What asks for more is damaged, or made to fill the memory.
+
+    Parameters
+    ----------
+    needed : int
+        Bytes that the content would take.
+    size : int
+        Bytes of the file.
+    """
+    return needed <= max(1 << 27, 20 * size)
+
+
 def unknown_name(kind: str, name: object, known: Sequence[str]) -> str:
     """Return the message for an unknown name: the nearest known names, and some of all names.
 
