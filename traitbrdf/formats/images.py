@@ -2,22 +2,49 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import math
-import struct
-from typing import Any, BinaryIO
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from traitbrdf.formats.files import FormatError, PathName, atomic_path, file_size, open_binary
+from traitbrdf.formats.exr import MAGIC, read_exr
+from traitbrdf.formats.files import FormatError, PathName, atomic_path, open_binary
+from traitbrdf.formats.radiance import decode_radiance
 
 Float32 = NDArray[np.float32]
-_MAX_PIXELS = 1 << 27  # 16384 x 8192; a header that asks for more counts as damaged
+Float64 = NDArray[np.float64]
 _HALF_LIMIT = 65520.0  # numbers from here on round to infinity in half precision
+
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""x and y of red, green, blue and white of Rec.709."""
+
+_PICTURES = {
+    b"\x89PNG": "PNG", b"\xff\xd8\xff": "JPEG", b"GIF8": "GIF", b"BM": "BMP", b"RIFF": "WebP",
+    b"II*\0": "TIFF", b"MM\0*": "TIFF", b"8BPS": "Photoshop",
+}  # fmt: skip
+"""What files of other programs begin with."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A linear picture of a file.
+
+    Parameters
+    ----------
+    pixels : (H, W, 3) float32
+        Linear Rec.709, as stored save for the conversion of primaries.
+    converted : bool
+        Whether the file had other primaries, so that negative values are colours out of gamut.
+    cube : bool
+        Whether it is a map of six faces, stacked: +X, -X, +Y, -Y, +Z, -Z.
+    """
+
+    pixels: Float32
+    converted: bool
+    cube: bool
 
 
 # ---------------------------------------------------------------------------------------------
@@ -27,9 +54,7 @@ _HALF_LIMIT = 65520.0  # numbers from here on round to infinity in half precisio
 def read_image(path: PathName) -> Float32:
     """Read a linear OpenEXR or Radiance image; the content decides, not the extension.
 
-    OpenEXR: the channels R, G, B (or Y alone, repeated) of the first part, half or float, the
-    pixels of the data window; alpha is dropped. Radiance: flat and run-length encoded scanlines
-    (Ward, "Real Pixels", Graphics Gems II, 1991).
+    See `read_picture`.
 
     Parameters
     ----------
@@ -46,232 +71,85 @@ def read_image(path: PathName) -> Float32:
     FormatError
         If the file is neither of the two, truncated, damaged or has no colour channels.
     """
+    return read_picture(path).pixels
+
+
+def read_picture(path: PathName) -> Picture:
+    """Read a linear OpenEXR or Radiance image, and what it says about itself.
+
+    OpenEXR: the channels R, G, B (or Y alone, repeated) of the first part that has them, of any
+    type; the display window, black where it has no data. Radiance: scanlines of all kinds and
+    orientations, with exposure and colour correction divided out. Other primaries than Rec.709's
+    are converted: by way of CIE XYZ, unchanged in OpenEXR files, and scaled so that white stays
+    white (von Kries, in Bradford's space) in Radiance's, as each format demands.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    FileNotFoundError
+    FormatError
+        As `read_image`.
+    """
     with open_binary(path) as file:
         start = file.read(4)
-        if start == b"\x76\x2f\x31\x01":
-            _check_exr(path, file)
-        elif start.startswith(b"#?"):
-            file.seek(0)
-            return _decode_radiance(path, file.read())
-        else:
+        if start.startswith(b"#?"):
+            found = decode_radiance(path, start + file.read())
+            return _converted(path, found.pixels, found.primaries, False, keep_white=True)
+    if start == MAGIC:
+        stored = read_exr(path)
+        return _converted(path, stored.pixels, stored.chromaticities, stored.cube)
+    for beginning, name in _PICTURES.items():
+        if start.startswith(beginning):
             raise FormatError(
                 path,
-                "an OpenEXR or Radiance image",
-                f"a file that starts with {start!r}" if start else "an empty file",
+                "linear light, an OpenEXR or Radiance image",
+                f"a {name} picture, which holds display values: decode it by PIL.Image.open and "
+                "traitbrdf.formats.display.decode_srgb, and give the array to EnvironmentMap; or "
+                "let the program that made it write OpenEXR",
             )
-    return _read_exr(path)
+    got = f"a file that starts with {start!r}" if start else "an empty file"
+    raise FormatError(path, "an OpenEXR or Radiance image", got)
 
 
-def _read_exr(path: PathName) -> Float32:
-    said = io.StringIO()  # OpenEXR prints on damaged files, and a library must not
+def _converted(
+    path: PathName,
+    pixels: Float32,
+    primaries: tuple[float, ...] | None,
+    cube: bool,
+    keep_white: bool = False,
+) -> Picture:
+    if primaries is None or np.allclose(primaries, _REC709, atol=2e-3):
+        return Picture(pixels, False, cube)
     try:
-        with (
-            contextlib.redirect_stdout(said),
-            OpenEXR.File(str(path), separate_channels=True) as file,
-        ):
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-            sampling = {(c.xSampling, c.ySampling) for c in file.channels().values()}
-    except (RuntimeError, ValueError, TypeError) as error:  # OpenEXR raises these on damage
-        got = " ".join(said.getvalue().split()) or str(error)
-        raise FormatError(path, "a readable OpenEXR image", got) from error
-    if all(name in channels for name in "RGB"):
-        planes = [channels[name] for name in "RGB"]
-    elif "Y" in channels and not {"RY", "BY"} & set(channels):  # RY and BY are subsampled chroma
-        planes = [channels["Y"]] * 3
-    else:
-        raise FormatError(
-            path, "channels R, G, B or Y", f"channels {', '.join(sorted(channels)) or 'none'}"
-        )
-    if sampling != {(1, 1)} or any(plane.dtype.kind != "f" for plane in planes):
-        raise FormatError(
-            path,
-            "half or float channels at full resolution",
-            f"{', '.join(str(p.dtype) for p in planes)}, sampling {sorted(sampling)}",
-        )
-    return np.stack(planes, axis=-1).astype(np.float32)
+        matrix = _to_rec709(primaries, keep_white)
+    except (np.linalg.LinAlgError, ZeroDivisionError, FloatingPointError):
+        matrix = np.full((3, 3), np.nan)
+    if not np.isfinite(matrix).all():
+        raise FormatError(path, "chromaticities of three colours and white", str(primaries))
+    return Picture(np.asarray(pixels @ matrix.T, np.float32), True, cube)
 
 
-_EXR_CHUNK_LINES = {
-    0: 1,
-    1: 1,
-    2: 1,
-    3: 16,
-    4: 32,
-    5: 16,
-    6: 32,
-    7: 32,
-    8: 32,
-    9: 256,
-    10: 256,
-    11: 32,
-}
+def _to_xyz(primaries: tuple[float, ...]) -> Float64:
+    """Return the matrix (3, 3) from RGB to CIE XYZ, Y of white 1 (SMPTE RP 177, 1993)."""
+    xy = np.array(primaries, np.float64).reshape(4, 2)
+    xyz = np.concatenate([xy.T, 1.0 - xy.sum(axis=1)[None]])
+    return np.asarray(xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3] / xyz[1, 3]))
 
 
-def _check_exr(path: PathName, file: BinaryIO) -> None:
-    """Find truncation and absurd sizes before OpenEXR, which would print and allocate first.
-
-    Walks the header and the chunk table as documented in "OpenEXR File Layout". Of multi-part and
-    tiled files it checks the header only.
-    """
-    size = file_size(file)
-
-    def take(count: int, what: str) -> bytes:
-        data = file.read(count) if 0 <= count <= size else b""
-        if count < 0 or len(data) < count:
-            raise FormatError(path, "a complete OpenEXR file", f"{size} bytes, cut within {what}")
-        return data
-
-    def name() -> bytes:
-        letters = b""
-        while (letter := take(1, "the header")) != b"\0":
-            letters += letter
-            if len(letters) > 255:  # the format's own limit
-                raise FormatError(path, "an OpenEXR header", "an attribute name without an end")
-        return letters
-
-    (flags,) = struct.unpack("<I", take(4, "the header"))
-    if flags & 0xFF != 2 or flags & 0x800:
-        kind = "deep data" if flags & 0x800 else f"version {flags & 0xFF}"
-        raise FormatError(path, "an OpenEXR 2 image of flat pixels", kind)
-    attributes = {}
-    while key := name():
-        name()  # its type
-        (length,) = struct.unpack("<i", take(4, "the header"))
-        attributes[key] = take(length, "the header")
-    try:
-        x0, y0, x1, y1 = struct.unpack("<4i", attributes[b"dataWindow"])
-        (compression,) = attributes[b"compression"]
-    except (KeyError, ValueError, struct.error):
-        raise FormatError(
-            path,
-            "an OpenEXR header with dataWindow and compression",
-            f"{len(attributes)} attributes without them",
-        ) from None
-    width, height = x1 - x0 + 1, y1 - y0 + 1
-    if width < 1 or height < 1 or width * height > _MAX_PIXELS:
-        raise FormatError(path, f"at most {_MAX_PIXELS} pixels", f"a {width} x {height} image")
-    if flags & (0x200 | 0x1000) or compression not in _EXR_CHUNK_LINES:
-        return
-    count = -(-height // _EXR_CHUNK_LINES[compression])
-    for offset in np.frombuffer(take(8 * count, "the table of chunks"), "<u8").tolist():
-        length = size
-        if 0 < offset <= size - 8:  # an interrupted writer leaves zeros in the table
-            file.seek(offset + 4)
-            (length,) = struct.unpack("<I", file.read(4))
-        if offset + 8 + length > size:
-            raise FormatError(path, "a complete OpenEXR file", f"{size} bytes, cut within pixels")
-
-
-def _decode_radiance(path: PathName, data: bytes) -> Float32:
-    """Decode a Radiance picture (Ward, "Real Pixels", Graphics Gems II, 1991).
-
-    Handles flat, old and new run-length scanlines, in either direction of rows and columns. A pixel
-    is mantissa * 2^(exponent - 136), as most programs read it (Radiance itself adds half a step to
-    the mantissa). EXPOSURE lines are divided out, as the format demands.
-    """
-    exposure = 1.0
-    position = 0
-    while True:
-        end = data.find(b"\n", position)
-        if end < 0:
-            raise FormatError(path, "a Radiance header", f"{len(data)} bytes without its end")
-        line = data[position:end].strip()
-        position = end + 1
-        if not line:
-            break
-        key, _, value = line.partition(b"=")
-        if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-            raise FormatError(path, "FORMAT=32-bit_rle_rgbe", repr(value.decode("latin-1")))
-        if key == b"EXPOSURE":
-            try:
-                exposure *= float(value)
-            except ValueError:
-                exposure = math.nan
-    if not (math.isfinite(exposure) and exposure > 0.0):
-        raise FormatError(path, "a positive EXPOSURE", str(exposure))
-    end = data.find(b"\n", position)
-    words = data[position : max(end, position)].split()
-    rows, columns = words[0::2], words[1::2]
-    if not (
-        len(words) == 4
-        and rows[0] in (b"-Y", b"+Y")
-        and rows[1] in (b"+X", b"-X")
-        and all(number.isdigit() and len(number) < 10 for number in columns)
-    ):
-        shown = data[position : position + 40].decode("latin-1")
-        raise FormatError(path, "a resolution line like '-Y 256 +X 512'", repr(shown))
-    height, width = int(columns[0]), int(columns[1])
-    if height < 1 or width < 1 or width * height > _MAX_PIXELS:
-        raise FormatError(path, f"1 to {_MAX_PIXELS} pixels", f"a {width} x {height} image")
-    # at best a run holds 127 pixels of a channel, or 2^24 pixels in the old format
-    if (len(data) - end) * (1 << 22) < width * height:
-        raise FormatError(path, "a complete Radiance image", f"{len(data)} bytes")
-    rgbe = _radiance_pixels(path, data, end + 1, height, width)
-    scale = np.ldexp(1.0 / exposure, rgbe[..., 3:].astype(np.int64) - 136)
-    scale[rgbe[..., 3:] == 0] = 0.0
-    image = (rgbe[..., :3] * scale).astype(np.float32)
-    if words[0] == b"+Y":
-        image = image[::-1]
-    if words[2] == b"-X":
-        image = image[:, ::-1]
-    return np.ascontiguousarray(image)
-
-
-def _radiance_pixels(
-    path: PathName, data: bytes, position: int, height: int, width: int
-) -> NDArray[np.uint8]:
-    """Return (height, width, 4) mantissas and exponents of all scanlines from `position` on."""
-
-    def damaged(row: int, what: str) -> FormatError:
-        return FormatError(path, f"{height} scanlines of {width} pixels", f"{what} in row {row}")
-
-    rows = []  # row by row: a false size in the header must not allocate memory
-    previous = bytes(4)
-    for row in range(height):
-        start = data[position : position + 4]
-        if 8 <= width < 32768 and start == bytes((2, 2, width >> 8, width & 255)):
-            position += 4
-            line = bytearray()
-            while len(line) < 4 * width:  # four channels, one after another
-                channel_end = (len(line) // width + 1) * width
-                code = data[position] if position < len(data) else 0
-                run = code > 128
-                count = code - 128 if run else code
-                piece = data[position + 1 : position + 1 + (1 if run else count)]
-                if len(piece) < (1 if run else count) or position >= len(data):
-                    raise damaged(row, "the end of the file")
-                if count == 0 or len(line) + count > channel_end:
-                    raise damaged(row, f"a run of {count} pixels")
-                line += piece * count if run else piece
-                position += 1 + len(piece)
-            pixels = np.frombuffer(bytes(line), np.uint8).reshape(4, width).T
-        else:
-            flat = np.frombuffer(data[position : position + 4 * width], np.uint8)
-            markers = flat[: len(flat) // 4 * 4].reshape(-1, 4)[:, :3] == 1
-            if len(flat) == 4 * width and not markers.all(axis=1).any():
-                pixels = flat.reshape(width, 4)
-                position += 4 * width
-            else:  # old runs: (1, 1, 1, n) repeats the previous pixel; n shifts by 8 bits each time
-                line = bytearray()
-                shift = 0
-                while len(line) < 4 * width:
-                    pixel = data[position : position + 4]
-                    position += 4
-                    if len(pixel) < 4:
-                        raise damaged(row, "the end of the file")
-                    if pixel[:3] == b"\1\1\1":
-                        count = pixel[3] << shift
-                        shift += 8
-                        if len(line) + 4 * count > 4 * width or shift > 24:
-                            raise damaged(row, f"a run of {count} pixels")
-                        line += previous * count
-                    else:
-                        line += pixel
-                        previous, shift = pixel, 0
-                pixels = np.frombuffer(bytes(line), np.uint8).reshape(width, 4)
-        rows.append(pixels)
-        previous = pixels[-1].tobytes()
-    return np.stack(rows)
+def _to_rec709(primaries: tuple[float, ...], keep_white: bool) -> Float64:
+    """Return the matrix (3, 3) from RGB of other primaries to Rec.709."""
+    with np.errstate(divide="raise", invalid="raise", over="raise"):
+        source, target = _to_xyz(primaries), _to_xyz(_REC709)
+        if keep_white:
+            cone = np.array(
+                [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+            )
+            ratio = (cone @ target.sum(axis=1)) / (cone @ source.sum(axis=1))
+            source = np.linalg.solve(cone, ratio[:, None] * (cone @ source))
+        return np.asarray(np.linalg.solve(target, source))
 
 
 def _as_image(image: ArrayLike, dtype: Any) -> NDArray[Any]:

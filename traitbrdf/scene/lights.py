@@ -12,17 +12,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import Array, direction_to_latlong, latlong_to_direction
 from traitbrdf.formats.files import FormatError
-from traitbrdf.formats.images import read_image
+from traitbrdf.formats.images import Picture, read_picture
 
 Float64 = NDArray[np.float64]
 Layout = Literal["latlong", "angular", "mirrorball"]
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,11 @@ class EnvironmentMap:
         image = np.asarray(radiance)
         if image.ndim != 3 or image.shape[-1] != 3 or 0 in image.shape:
             raise ValueError(f"radiance: expected shape (rows, columns, 3), got {image.shape}")
+        if image.dtype in (np.uint8, np.uint16):
+            raise TypeError(
+                f"radiance: expected linear light as floats, got {image.dtype}, which pictures for "
+                "display have: decode them by traitbrdf.formats.display.decode_srgb"
+            )
         if not (np.issubdtype(image.dtype, np.number) and np.isrealobj(image)):
             raise TypeError(f"radiance: expected real numbers, got dtype {image.dtype}")
         with np.errstate(over="ignore"):
@@ -166,21 +172,23 @@ class EnvironmentMap:
         return f"EnvironmentMap({m}x{n}, rotation={self.rotation:.4g})"
 
     @classmethod
-    def read(cls, path: str | PathLike[str], layout: Layout = "latlong") -> EnvironmentMap:
+    def read(cls, path: str | PathLike[str], layout: Layout | None = None) -> EnvironmentMap:
         """Read an HDR image (.exr, .hdr).
 
         Maps that were shrunk with a sharpening filter undershoot next to bright texels. Negative
         values of at most a quarter of the brightest of the surrounding 7 x 7 texels are taken for
-        such undershoot and set to 0; `clipped_texels` counts them. Any other negative value is an
-        error.
+        such undershoot and set to 0, as are colours out of gamut where a file has other primaries
+        than Rec.709's; `clipped_texels` counts them. Any other negative value is an error.
 
         Parameters
         ----------
         path : path-like
         layout : "latlong", "angular" or "mirrorball"
-            Angular maps (Debevec 1998) have -z at the centre and +z at the rim. A mirror ball is
-            the picture of a chrome ball by a distant camera that looks along -z: its centre
-            reflects +z. Both are resampled to lat-long, bilinearly.
+            Without it the file has to be a lat-long map, twice as wide as high, or to say that it
+            is a cube map (OpenEXR's ``envmap``). Angular maps (Debevec 1998) have -z at the centre
+            and +z at the rim. A mirror ball is the picture of a chrome ball by a distant camera
+            that looks along -z: its centre reflects +z. All others are resampled to lat-long,
+            bilinearly.
 
         Raises
         ------
@@ -188,18 +196,29 @@ class EnvironmentMap:
         ValueError
             On another layout.
         traitbrdf.formats.files.FormatError
-            If the file is no such image, or its radiance is negative or not finite.
+            If the file is no such image, its radiance is negative or not finite, or it is no
+            lat-long map by its size and no layout is given.
         """
-        if layout not in ("latlong", "angular", "mirrorball"):
+        if layout not in (None, *LAYOUTS):
             raise ValueError(
-                f"layout: expected 'latlong', 'angular' or 'mirrorball', got {layout!r}"
+                f"layout: expected {', '.join(map(repr, LAYOUTS[:-1]))} or {LAYOUTS[-1]!r}, got "
+                f"{layout!r}"
             )
-        image = read_image(path)
-        ringing = _ringing(image)
+        picture = read_picture(path)
+        image = picture.pixels
+        height, width, _ = image.shape
+        if layout is None and not picture.cube and abs(width - 2 * height) > 1:
+            raise FormatError(
+                path,
+                "a lat-long map, twice as wide as high, or a named layout",
+                f"{width} x {height} pixels; say layout='angular' or 'mirrorball' if it is one, "
+                "or 'latlong' to stretch it over the sphere",
+            )
+        ringing = (image < 0.0) if picture.converted else _ringing(image)
         image = np.where(ringing, np.float32(0.0), image)
         if fault := _fault(image):
             raise FormatError(path, *fault)
-        result = cls(image if layout == "latlong" else _unwrap_probe(image, layout))
+        result = cls(_unwrapped(Picture(image, picture.converted, picture.cube), layout, path))
         result.clipped_texels = int(np.count_nonzero(ringing.any(-1)))
         return result
 
@@ -390,7 +409,11 @@ def _fault(image: NDArray[np.float32]) -> tuple[str, str] | None:
     """Return what is expected of radiance (M, N, 3) and what it is; None if it is valid."""
     bad = int(np.count_nonzero(~np.isfinite(image)))
     if bad:
-        return "finite float32 radiance", f"{bad} values that are not"
+        return (
+            "finite float32 radiance",
+            f"{bad} values that are not; half-precision files end at 65504: write 32 bits, or "
+            "give np.nan_to_num(pixels, posinf=65504) to EnvironmentMap",
+        )
     bad = int(np.count_nonzero(image < 0.0))
     if bad:
         return "radiance that is not negative", f"{bad} values down to {image.min():.6g}"
@@ -422,14 +445,22 @@ def _bilinear(image: NDArray[np.float32], x: Array, y: Array, wrap: bool) -> Arr
     return result
 
 
-def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
-    """Resample a probe image (angular map or mirror ball) to a lat-long map of half its height."""
+def _unwrapped(picture: Picture, layout: Layout | None, path: str | PathLike[str]) -> NDArray[Any]:
+    """Resample a probe image or a cube map to a lat-long map; leave lat-long maps as they are."""
+    image = picture.pixels
     size_y, size_x, _ = image.shape
-    rows = max(size_y // 2, 1)
+    cube = picture.cube and layout is None
+    if layout == "latlong" or (layout is None and not cube):
+        return image
+    if cube and (size_y != 6 * size_x or size_x < 2):
+        raise FormatError(path, "six faces in a column", f"{size_x} x {size_y} pixels")
+    rows = 2 * size_x if cube else max(size_y // 2, 1)
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij"
     )
     w = latlong_to_direction(u, v)
+    if cube:
+        return _on_faces(image, w)
     across = np.hypot(w[..., 0], w[..., 1])
     safe = np.where(across > 0.0, across, 1.0)
     if layout == "angular":
@@ -439,3 +470,33 @@ def _unwrap_probe(image: NDArray[np.float32], layout: Layout) -> NDArray[Any]:
     x = 0.5 * (1.0 + r * w[..., 0] / safe) * size_x - 0.5
     y = 0.5 * (1.0 - r * w[..., 1] / safe) * size_y - 0.5
     return _bilinear(image, x, y, wrap=False)
+
+
+def _on_faces(image: NDArray[np.float32], w: Array) -> NDArray[Any]:
+    """Look directions (..., 3) up in a cube map (6 n, n, 3), bilinearly within a face.
+
+    Faces and their orientation are those of OpenEXR's ImfEnvmap.h. Its lat-long maps have +z in the
+    middle and +x to the left, ours -z and +x to the right: it is turned by 180 degrees.
+    """
+    size = image.shape[1]
+    d = np.stack([-w[..., 0], w[..., 1], -w[..., 2]], axis=-1)
+    axis = np.argmax(np.abs(d), axis=-1)  # the first of equal ones, as in OpenEXR
+    most = np.take_along_axis(d, axis[..., None], axis=-1)[..., 0]
+    # centres of border pixels lie on the cube's edges
+    place = (d / np.abs(most)[..., None] + 1.0) * 0.5 * (size - 1)
+    across, down = np.empty(axis.shape), np.empty(axis.shape)
+    px, py, pz = np.moveaxis(place, -1, 0)
+    back = size - 1
+    for face, (i, j) in enumerate((
+        (pz, back - py), (back - pz, back - py),
+        (px, back - pz), (px, pz),
+        (back - px, back - py), (px, back - py),
+    )):  # fmt: skip
+        own = (axis == face // 2) & ((most > 0.0) == (face % 2 == 0))
+        across[own], down[own] = i[own], j[own]
+    faces = image.reshape(6, size, size, 3)
+    result = np.zeros((*axis.shape, 3), np.float32)
+    for face in range(6):
+        own = (axis == face // 2) & ((most > 0.0) == (face % 2 == 0))
+        result[own] = _bilinear(faces[face], across[own], down[own], wrap=False)
+    return result
