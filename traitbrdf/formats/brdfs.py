@@ -74,6 +74,8 @@ def read_merl(path: PathName) -> Float64:
 def write_merl(path: PathName, values: ArrayLike) -> None:
     """Write a MERL ``.binary`` file; `read_merl` returns the same values up to rounding.
 
+    What it returns is written with the same bytes again.
+
     Parameters
     ----------
     path : path-like
@@ -96,7 +98,10 @@ def write_merl(path: PathName, values: ArrayLike) -> None:
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<3i", *table.shape[:3]))
         for channel, scale in enumerate(MERL_SCALE):
-            file.write((table[..., channel].astype(np.float64) / scale).astype("<f8").tobytes())
+            stored = table[..., channel].astype(np.float64) / scale
+            for _ in range(3):  # to numbers that come back unchanged when they are read and written
+                stored = stored * scale / scale
+            file.write(stored.astype("<f8").tobytes())
 
 
 # ---------------------------------------------------------------------------------------------
@@ -182,6 +187,33 @@ def read_rgl(path: PathName) -> RGLFields:
     fields = RGLFields(**arrays, jacobian=jacobian, description=description)
     _check_rgl(path, fields)
     return fields
+
+
+def write_rgl(path: PathName, fields: RGLFields) -> None:
+    """Write an RGL ``.bsdf`` material in its RGB variant; see `read_rgl` for the container.
+
+    Parameters
+    ----------
+    path : path-like
+    fields : RGLFields
+    """
+    text = fields.description.encode() or b"\0"
+    arrays: dict[str, NDArray[Any]] = {
+        "description": np.frombuffer(text, "u1"),
+        **{name: np.ascontiguousarray(getattr(fields, name), "<f4") for name in _RGL_RANKS},
+        "jacobian": np.array([fields.jacobian], "u1"),
+    }
+    head = _TENSOR_MAGIC + struct.pack("<2BI", 1, 0, len(arrays))
+    size = len(head) + sum(2 + len(n) + 11 + 8 * a.ndim for n, a in arrays.items())
+    for name, array in arrays.items():
+        kind = _TENSOR_TYPES.index("u1" if array.dtype == np.uint8 else "<f4") + 1
+        head += struct.pack(f"<H{len(name)}sHBQ", len(name), name.encode(), array.ndim, kind, size)
+        head += struct.pack(f"<{array.ndim}Q", *array.shape)
+        size += array.nbytes
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(head)
+        for array in arrays.values():
+            file.write(array.tobytes())
 
 
 def _tensor_table(path: PathName, file: BinaryIO) -> dict[str, tuple[str, int, tuple[int, ...]]]:

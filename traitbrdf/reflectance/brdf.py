@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
@@ -25,13 +26,17 @@ from traitbrdf.directions import (
     from_half_diff_angles,
     half_diff_angles,
 )
-from traitbrdf.formats.brdfs import read_merl, write_merl
-from traitbrdf.formats.files import FormatError, stem
+from traitbrdf.formats.brdfs import MERL_SCALE, read_merl, write_merl, write_rgl
+from traitbrdf.formats.files import FormatError, read_arrays, stem, write_arrays
+from traitbrdf.reflectance.measured import rgl_fields
 
 if TYPE_CHECKING:
     import scipy.sparse
 
 Float64 = NDArray[np.float64]
+
+SUFFIXES = (".binary", ".bsdf", ".npz")
+"""Of the files that `TabulatedBRDF.write` writes."""
 
 _Bracket: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64], Float64]
 """Indices of the lower nodes, of the upper nodes, and the weights of the upper ones."""
@@ -175,6 +180,22 @@ class HalfDiffGrid:
         """Mask, of the grid's shape, of nodes with both directions above the horizon."""
         return np.asarray(self.lower_cosine > 1e-9)
 
+    @cached_property
+    def reached(self) -> NDArray[np.bool_]:
+        """Mask, of the grid's shape, of nodes that some pair of directions above the horizon uses.
+
+        Of the bins around a node, the corner with the lowest theta_h and theta_d is seen best, at
+        the azimuth nearest to 90 degrees.
+        """
+        lowest = [np.maximum(np.arange(n) - 1, 0) for n in self.shape[:2]]
+        cosines = np.abs(np.cos(self.phi_d))
+        ends = (-1, 0) if self.layout == "merl" else (0, -1)  # periodic, or folded at both ends
+        padded = np.concatenate([cosines[[ends[0]]], cosines, cosines[[ends[1]]]])
+        cosine = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+        th, td = self.theta_h[lowest[0]][:, None, None], self.theta_d[lowest[1]][:, None]
+        lower = np.cos(th) * np.cos(td) - np.sin(th) * np.sin(td) * cosine
+        return np.asarray(lower > 0.0)
+
     def stencil(
         self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
     ) -> tuple[NDArray[np.int64], Float64]:
@@ -316,7 +337,9 @@ class TabulatedBRDF:
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> TabulatedBRDF:
-        """Read a MERL ``.binary`` file; invalid (negative) cells become 0.
+        """Read a MERL ``.binary`` file, whose invalid (negative) cells become 0, or an ``.npz``.
+
+        For ``.bsdf`` see `MeasuredBRDF.read`.
 
         Parameters
         ----------
@@ -326,8 +349,11 @@ class TabulatedBRDF:
         ------
         FileNotFoundError
         traitbrdf.formats.files.FormatError
-            As `traitbrdf.formats.brdfs.read_merl`, or on fewer than 2 nodes along an axis.
+            As `traitbrdf.formats.brdfs.read_merl`, or on fewer than 2 nodes along an axis, or an
+            ``.npz`` that `write` has not made.
         """
+        if Path(path).suffix.lower() == ".npz":
+            return cls._read_arrays(path)
         values = read_merl(path)
         n_h, n_d, n_p, _ = values.shape
         if min(n_h, n_d, n_p) < 2:
@@ -335,12 +361,86 @@ class TabulatedBRDF:
         grid = HalfDiffGrid(n_h, n_d, n_p, "merl")
         return cls(grid, np.maximum(values, 0.0), name=stem(path))
 
-    def write(self, path: str | PathLike[str]) -> None:
-        """Write a MERL ``.binary`` file to `path`, resampled to that format's 90 x 90 x 180 grid.
+    @classmethod
+    def _read_arrays(cls, path: str | PathLike[str]) -> TabulatedBRDF:
+        arrays = read_arrays(path)
+        if not {"values", "layout", "mirror"} <= set(arrays) or arrays["values"].ndim != 4:
+            raise FormatError(
+                path, "a table, with values, layout and mirror", ", ".join(arrays) or "no arrays"
+            )
+        try:
+            n_h, n_d, n_p, _ = arrays["values"].shape
+            grid = HalfDiffGrid(n_h, n_d, n_p, str(arrays["layout"]))  # type: ignore[arg-type]
+            return cls(grid, arrays["values"], arrays["mirror"], stem(path))
+        except (ValueError, TypeError) as error:
+            raise FormatError(path, "a table of a BRDF", str(error)) from error
 
-        The format has no field for `mirror`, so it is not written.
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write a file: MERL ``.binary``, RGL ``.bsdf`` or, without any loss, ``.npz``.
+
+        MERL: a table on another grid is fitted on that format's 90 x 90 x 180 without regard to the
+        horizon, so that the file read here looks as the table does: nodes below the horizon count
+        where part of the bins around them is above it. Nodes that no visible pair of directions
+        reaches are marked invalid, as the format has it. RGL: see
+        `traitbrdf.reflectance.measured.rgl_fields`. Neither has a field for `mirror`, so that is
+        not written.
+
+        Parameters
+        ----------
+        path : path-like
+            Its suffix selects the format.
+
+        Raises
+        ------
+        ValueError
+            On another suffix.
         """
-        write_merl(path, self.regrid(HalfDiffGrid.merl()).values)
+        suffix = Path(path).suffix.lower()
+        if suffix == ".binary":
+            grid = HalfDiffGrid.merl()
+            values = self.values.astype(np.float64) if self.grid == grid else self._fitted(grid)
+            unseen = ~grid.reached & (self.grid != grid or ~values.any(axis=-1))
+            values[unseen] = -np.array(MERL_SCALE)  # -1 in the file's own unit
+            write_merl(path, values)
+        elif suffix == ".bsdf":
+            write_rgl(path, rgl_fields(self._anywhere, 2 * self.grid.n_theta_h - 1, self.name))
+        elif suffix == ".npz":
+            layout = np.array(self.grid.layout)
+            write_arrays(path, {"values": self.values, "layout": layout, "mirror": self._mirror})
+        else:
+            raise ValueError(f"path: expected a name in {', '.join(SUFFIXES)}, got {str(path)!r}")
+
+    def _anywhere(self, theta_h: Float64, theta_d: Float64, phi_d: Float64) -> Float64:
+        """Interpolate the table at angles (...), without regard to the horizon."""
+        index, weight = self.grid.stencil(theta_h, theta_d, phi_d)
+        flat = self.values.reshape(-1, 3)
+        return np.asarray(np.einsum("...k,...kc->...c", weight, flat[index]), np.float64)
+
+    def _fitted(self, grid: HalfDiffGrid) -> Float64:
+        """Return values at another grid's nodes between which integrals are those of the table.
+
+        Samples would not do: between them, a chord passes above each kink of the table. The factors
+        (Richardson 1972, Lucy 1974) keep values positive, where a least-squares fit would ring.
+        """
+        axes = (_Overlap.of(self.grid.theta_h, grid.theta_h),
+                _Overlap.of(self.grid.theta_d, grid.theta_d))  # fmt: skip
+        table = self.values.astype(np.float64)
+
+        def both(one: Float64, other: Float64, values: Float64) -> Float64:
+            found: Float64 = np.einsum("ah,bd,hdpc->abpc", one, other, values, optimize=True)
+            return found
+
+        wanted = both(axes[0].mixed, axes[1].mixed, table)
+        values = both(axes[0].samples, axes[1].samples, table)
+        for _ in range(_FITTING):
+            found = both(axes[0].own, axes[1].own, values)
+            values *= np.where(found > 0.0, wanted / np.maximum(found, 1e-300), 1.0)
+        _, _, (low, high, share) = self.grid._brackets(
+            grid.theta_h[:1], grid.theta_d[:1], grid.phi_d
+        )
+        lower, upper = values[:, :, low], values[:, :, high]
+        result: Float64 = lower + share[:, None] * (upper - lower)
+        return result
 
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Return f_r (..., 3) in 1/sr, without the cosine.
@@ -418,6 +518,43 @@ class TabulatedBRDF:
         logs -= floor
         np.maximum(logs, 0.0, out=logs)
         return TabulatedBRDF(grid, logs, self._mirror, self.name)
+
+
+_FITTING = 12
+"""Times that values of a fitted table are multiplied by what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Overlap:
+    """How piecewise linear functions on two sets of nodes overlap.
+
+    Attributes
+    ----------
+    samples : (n, m) array
+        Values of the first ones at the second nodes.
+    mixed, own : (n, m) and (n, n) arrays
+        Means of the first functions, and of the second ones, weighted by each of the second hats.
+    """
+
+    samples: Float64
+    mixed: Float64
+    own: Float64
+
+    @classmethod
+    def of(cls, first: Float64, second: Float64) -> _Overlap:
+        """Return the overlap of nodes (m,) and (n,), ascending angles up to pi / 2."""
+        breaks = np.unique(np.concatenate([first, second, [math.pi / 2]]))
+        x, w = np.polynomial.legendre.leggauss(3)
+        low, step = breaks[:-1, None], np.diff(breaks)[:, None]
+        places, weights = (low + 0.5 * step * (x + 1.0)).ravel(), (0.5 * step * w).ravel()
+        ones, others = _hats(first, places), _hats(second, places)
+        weighted = others * (weights[:, None] / (weights @ others))
+        return cls(_hats(first, second), weighted.T @ ones, weighted.T @ others)
+
+
+def _hats(nodes: Float64, places: Float64) -> Float64:
+    """Return the linear interpolation weights (n, m) of nodes (m,) at places (n,)."""
+    return np.stack([np.interp(places, nodes, row) for row in np.eye(len(nodes))], axis=1)
 
 
 def _mirror_weight(value: ArrayLike) -> Float64:

@@ -13,13 +13,14 @@ and the data are extrapolated.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from traitbrdf.directions import Array, as_directions
+from traitbrdf.directions import Array, as_directions, half_diff_angles
 from traitbrdf.formats.brdfs import RGLFields, read_rgl
 from traitbrdf.formats.files import FormatError, stem
 
@@ -29,7 +30,70 @@ Index = NDArray[np.int64]
 MIN_COS = 1e-3
 """Floor of the cosine that is divided out; it acts only within 0.06 degrees of the horizon."""
 
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
 _CHUNK = 1 << 15  # pairs of directions at a time: keeps the temporaries below some 30 MB
+
+
+_ELEVATIONS = 46  # of the first direction in files that are written, close together at the horizon
+
+
+def rgl_fields(
+    f: Callable[[Float64, Float64, Float64], Float64], nodes: int, description: str = ""
+) -> RGLFields:
+    """Return the fields of an RGL material that holds any isotropic BRDF.
+
+    The format warps the unit square by a density of visible normals. A constant one leaves it as it
+    is: its axes are then sqrt(theta_h 2 / pi), along which tables have their nodes as well, and the
+    azimuth between the half vector and the first direction. So no BRDF needs a microfacet
+    distribution. What is stored is f times the cosine of the second direction, below the horizon
+    too, where it is negative: so it vanishes at the horizon between the nodes.
+
+    Parameters
+    ----------
+    f : callable
+        f(theta_h, theta_d, phi_d) returns f_r (..., 3) in 1/sr for angles (...) in radians, also
+        where a direction is below the horizon.
+    nodes : int
+        Nodes along each axis of the square, at least 2.
+    description : str
+    """
+    theta_i = np.radians(89.5 * (1.0 - np.linspace(1.0, 0.0, _ELEVATIONS) ** 1.4))
+    share = np.linspace(0.0, 1.0, nodes)
+    theta_h = (share**2 * (0.5 * math.pi))[None, :]
+    phi = ((2.0 * share - 1.0) * math.pi)[:, None]  # of the half vector, wi at azimuth 0
+    half = np.stack(
+        [np.sin(theta_h) * np.cos(phi), np.sin(theta_h) * np.sin(phi), np.cos(theta_h) + 0.0 * phi],
+        axis=-1,
+    )
+    # a least-squares fit: chords between samples would pass above what rises towards the horizon
+    x, w = np.polynomial.legendre.leggauss(3)
+    step = np.diff(theta_i)[:, None]
+    angles = (theta_i[:-1, None] + 0.5 * step * (x + 1.0)).ravel()
+    hats = np.stack([np.interp(angles, theta_i, row) for row in np.eye(_ELEVATIONS)])
+    weighted = hats * (0.5 * step * w).ravel()
+    sums = np.zeros((_ELEVATIONS, nodes, nodes, 3))
+    for k, angle in enumerate(angles):
+        wi = np.array([math.sin(angle), 0.0, math.cos(angle)])
+        dot = half @ wi
+        wo = 2.0 * dot[..., None] * half - wi
+        found = half_diff_angles(np.broadcast_to(wi, wo.shape), wo)
+        _, theta_d, phi_d = (np.asarray(one, np.float64) for one in found)
+        value = f(np.broadcast_to(theta_h, dot.shape), theta_d, phi_d) * wo[..., 2:]
+        value[dot <= 0.0] = 0.0
+        for row in np.flatnonzero(weighted[:, k]):
+            sums[row] += weighted[row, k] * value
+    fitted = np.linalg.solve(weighted @ hats.T, sums.reshape(_ELEVATIONS, -1))
+    stored = fitted.reshape(1, _ELEVATIONS, nodes, nodes, 3).astype(np.float32)
+    rgb = np.ascontiguousarray(np.moveaxis(stored, -1, 2))
+    luminance = np.maximum(np.einsum("ptcyx,c->ptyx", rgb, _LUMINANCE), 0.0)
+    luminance += 1e-3 * luminance.mean(axis=(2, 3), keepdims=True) + 1e-6
+    ones = np.ones((2, 2), np.float32)
+    return RGLFields(
+        np.zeros(1, np.float32), theta_i.astype(np.float32), ones, ones,
+        np.ones((1, _ELEVATIONS, 2, 2), np.float32), luminance.astype(np.float32), rgb, False,
+        description,
+    )  # fmt: skip
 
 
 class MeasuredBRDF:
