@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import half_diff_angles, reflect, to_local
 from traitbrdf.formats.display import exposure_of, tone_map
+from traitbrdf.host import steady_in_threads
 from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
 from traitbrdf.scene.lights import EnvironmentMap, Light, PointLight, texel_moments, turn_about_y
 from traitbrdf.scene.scene import Scene
@@ -70,6 +71,7 @@ class IntegrationError(RuntimeError):
     """The tolerance was not reached; the message names the point and the limit."""
 
 
+@steady_in_threads
 def radiance(
     normals: Float64,
     views: Float64,
@@ -145,6 +147,7 @@ def radiance(
     return result, error
 
 
+@steady_in_threads
 def fragments(
     scene: Scene,
     index: ArrayLike,
@@ -213,6 +216,7 @@ def fragments(
     return result, error
 
 
+@steady_in_threads
 def render(
     scene: Scene,
     brdfs: Reflectance | Mapping[str, Reflectance],

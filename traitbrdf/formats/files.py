@@ -7,6 +7,8 @@ import difflib
 import functools
 import os
 import secrets
+import shutil
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,7 +64,8 @@ def atomic_path(path: PathName) -> Iterator[Path]:
     Parameters
     ----------
     path : path-like
-        Where the file ends up. A symbolic link is followed and stays a link.
+        Where the file ends up. A symbolic link is followed and stays a link. A file that is
+        replaced keeps its rights. A device or a pipe is written to, once the content is complete.
 
     Raises
     ------
@@ -70,19 +73,38 @@ def atomic_path(path: PathName) -> Iterator[Path]:
         If the folder does not exist, or the block has written no file.
     IsADirectoryError
         If `path` is a folder.
+    PermissionError
+        If it may not be written.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise IsADirectoryError(f"{path}: expected the path of a file to write, got a folder")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{path}: expected an existing folder, got {target.parent}")
+    if target.exists() and not target.is_file():  # a device or a pipe stays what it is
+        with tempfile.TemporaryDirectory() as folder:
+            whole = Path(folder) / f"whole{target.suffix}"
+            yield whole
+            with whole.open("rb") as source, target.open("wb") as sink:
+                shutil.copyfileobj(source, sink)
+        return
+    denied = PermissionError(f"{path}: not allowed to write there")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise denied
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp{target.suffix}"
     try:
-        yield temporary
+        try:
+            yield temporary
+        except PermissionError as error:
+            if temporary.name in str(error.filename or ""):
+                raise denied from error
+            raise
         if not temporary.exists():
             raise FileNotFoundError(f"{path}: nothing was written to {temporary}")
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())  # without it a power cut could leave an empty file
+        if target.exists():
+            shutil.copymode(target, temporary)
         temporary.replace(target)
     except BaseException:
         temporary.unlink(missing_ok=True)

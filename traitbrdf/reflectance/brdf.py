@@ -28,6 +28,7 @@ from traitbrdf.directions import (
 )
 from traitbrdf.formats.brdfs import MERL_SCALE, read_merl, write_merl, write_rgl
 from traitbrdf.formats.files import FormatError, read_arrays, stem, write_arrays
+from traitbrdf.host import steady
 from traitbrdf.reflectance.measured import rgl_fields
 
 if TYPE_CHECKING:
@@ -269,6 +270,7 @@ def _kept_directions(grid: HalfDiffGrid) -> tuple[Float64, Float64]:
     return wi, wo
 
 
+@steady
 class TabulatedBRDF:
     """An isotropic BRDF given by its values on a half/difference grid.
 

@@ -24,6 +24,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.compiled import CACHED
 from traitbrdf.directions import Array, half_diff_angles
 from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF, albedo_operator
 
@@ -285,7 +286,7 @@ _CUBE_ROOT_OF_PI = math.pi ** (1 / 3)
 
 
 # numpy's divisions: code that raises errors would take most of the compile time
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=CACHED, error_model="numpy")
 def formulas(r: Any, out: Any) -> Any:
     """Fill `out` (m, len(DESCRIPTORS)) with `DESCRIPTORS` of readings `r` (m, len(READINGS), 3).
 
@@ -369,13 +370,13 @@ def formulas(r: Any, out: Any) -> Any:
         out[m, 22] = -math.log(_rounded(off_gold, 0.12) + 0.1)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=CACHED, error_model="numpy")
 def _rounded(square: Any, soft: Any) -> Any:
     """Return the root of `square`, smoothed at 0, where the root itself has a kink."""
     return math.sqrt(square + soft * soft) - soft
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=CACHED, error_model="numpy")
 def _opponents(rgb: Any) -> Any:
     """Return a* and b* of one linear RGB, as `cielab` does."""
     a = b = 0.0
@@ -389,7 +390,7 @@ def _opponents(rgb: Any) -> Any:
     return a, b
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=CACHED, error_model="numpy")
 def above(whole: Any, body: Any, soft: Any) -> Any:
     """Return a smooth max(whole - body, 0) that is positive and at most `whole`.
 
@@ -404,7 +405,7 @@ def above(whole: Any, body: Any, soft: Any) -> Any:
     return min(0.5 * (over + math.sqrt(over * over + soft * soft)), whole)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=CACHED, error_model="numpy")
 def _log_breadths(light: Any, body: Any, known: Any, powers: Any) -> Any:
     """Return the log integral breadth in theta_h of the lobe, and of the lobe to the power of 0.4.
 

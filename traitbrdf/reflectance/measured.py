@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf.directions import Array, as_directions, half_diff_angles
 from traitbrdf.formats.brdfs import RGLFields, read_rgl
 from traitbrdf.formats.files import FormatError, stem
+from traitbrdf.host import steady
 
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -96,6 +97,7 @@ def rgl_fields(
     )  # fmt: skip
 
 
+@steady
 class MeasuredBRDF:
     """A measured isotropic BRDF, evaluated in its own parametrisation.
 

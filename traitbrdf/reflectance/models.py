@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import as_directions
+from traitbrdf.host import steady
 
 Float64: TypeAlias = NDArray[np.float64]
 RGBLike: TypeAlias = float | Sequence[float] | NDArray[np.floating[Any]]
@@ -169,6 +170,11 @@ class Model:
 
     # makes numpy leave ``array * model`` to __rmul__ instead of building an array of models
     __array_ufunc__ = None
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "eval" in vars(cls):
+            cls.eval = steady(cls.eval)  # type: ignore[method-assign]
 
     def __post_init__(self) -> None:
         for parameter in self.parameters:

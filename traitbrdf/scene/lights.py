@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf.directions import Array, direction_to_latlong, latlong_to_direction
 from traitbrdf.formats.files import FormatError
 from traitbrdf.formats.images import Picture, read_picture
+from traitbrdf.host import steady
 
 Float64 = NDArray[np.float64]
 Layout = Literal["latlong", "angular", "mirrorball"]
@@ -122,6 +123,7 @@ def _triple(
     return float(a[0]), float(a[1]), float(a[2])
 
 
+@steady
 class EnvironmentMap:
     """Light from infinitely far away, on a lat-long grid of M rows by N columns.
 

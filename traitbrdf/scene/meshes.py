@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from traitbrdf.formats.files import FormatError
 from traitbrdf.formats.gltf import read_gltf
 from traitbrdf.formats.polygons import FLAT, read_obj, read_ply
+from traitbrdf.host import steady
 from traitbrdf.scene.shapes import Mesh, dots, to_unit
 
 Float = NDArray[np.float64]
@@ -22,6 +23,7 @@ _READERS = {".obj": read_obj, ".ply": read_ply, ".gltf": read_gltf, ".glb": read
 _PLACEHOLDER = re.compile(r"(geometry|GLTF|mesh|default)?([ _.]?\d+)?", re.IGNORECASE)
 
 
+@steady
 def load_mesh(path: str | PathLike[str]) -> Mesh:
     """Read a mesh file: Wavefront OBJ, PLY, glTF or glb.
 

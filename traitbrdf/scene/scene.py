@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.host import steady
 from traitbrdf.scene.camera import MAX_SUBSAMPLES, Camera, dots, image_size
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, Light, PointLight
 from traitbrdf.scene.shapes import Hits, Shape
@@ -40,6 +41,7 @@ _SEEN = (
 )  # fmt: skip
 
 
+@steady
 class Scene:
     """A shape under light, seen by a camera.
 

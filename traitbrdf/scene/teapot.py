@@ -9,6 +9,7 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.host import steady
 from traitbrdf.scene.shapes import Mesh, dots, to_unit
 
 Float = NDArray[np.float64]
@@ -16,6 +17,7 @@ Float = NDArray[np.float64]
 # ---------------------------------------------------------------------------------------- teapot
 
 
+@steady
 def teapot(resolution: int = 24) -> Mesh:
     """Return the Utah teapot: y up, handle at -x and spout at +x, 3.15 high.
 

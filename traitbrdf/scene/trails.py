@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.compiled import CACHED
 from traitbrdf.scene.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -212,7 +213,7 @@ def cover(
         _cover(weight, places, trail, begins, span, (*middle.tolist(), reach), fade, across)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=CACHED, nogil=True, error_model="numpy")
 def _cover(
     weight: Any, places: Any, trail: Any, begins: Any, span: Any, ball: Any, fade: Any, across: Any
 ) -> None:

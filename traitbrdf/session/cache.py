@@ -152,7 +152,7 @@ class Cache:
         ValueError
             If TRAITBRDF_CACHE_BYTES is no number of bytes.
         """
-        said = os.environ.get("TRAITBRDF_CACHE_BYTES", str(CACHE_BYTES))
+        said = os.environ.get("TRAITBRDF_CACHE_BYTES") or str(CACHE_BYTES)
         try:
             limit = int(said)
         except ValueError:
@@ -163,7 +163,7 @@ class Cache:
             return None
         chosen = os.environ.get("TRAITBRDF_CACHE")
         if chosen:
-            return cls(Path(chosen), limit)
+            return cls(Path(chosen).expanduser(), limit)
         try:
             folder = user_cache_path("traitbrdf", appauthor=False)
         except RuntimeError:  # a user without a home

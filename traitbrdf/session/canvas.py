@@ -40,7 +40,10 @@ class Canvas:
         scene = transport.scene
         self._transport = transport
         sizes = [0 if part is None else len(part.pixels) for part in transport.parts]
-        black = [PartFrame(torch.zeros(n, 3, device=transport.device), 0.0, 0.0) for n in sizes]
+        black = [
+            PartFrame(torch.zeros(n, 3, dtype=torch.float32, device=transport.device), 0.0, 0.0)
+            for n in sizes
+        ]
         self._backdrop = transport.compose(black).reshape(-1, 3)
         several = np.bincount(scene.pixels, minlength=len(scene.uncovered)) > 1
         # the share of the pixel that shows the backdrop is a part of the sum as well

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import Any, Unpack
+from typing import Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from traitbrdf.design.parameters import Parameters
 from traitbrdf.design.stack import Layers
 from traitbrdf.design.storage import SETTINGS, Stored, reading, write_design
 from traitbrdf.design.strokes import Stroke, region_weights
+from traitbrdf.host import steady_in_threads
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.scene.camera import image_size
 from traitbrdf.scene.lights import EnvironmentMap
@@ -52,6 +53,7 @@ _FIRST_GROUND = "concrete"
 _MEASURED = 256  # fragments at which the error of local paint is measured; few err much
 
 
+@steady_in_threads
 class EditSession(Viewer):
     """Materials of a scene's parts, edited by traits, rendered in real time.
 
@@ -806,6 +808,12 @@ class EditSession(Viewer):
         return {"error": error, "fragments": count}
 
     # -- files ----------------------------------------------------------------------------------
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "EditSession: expected no copy or pickle of a session, which has threads and prepared "
+            "light; session.save('design.tbr') and EditSession.load('design.tbr') carry a design"
+        )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the design (present view and light, layers, own traits) to one file, atomically.

@@ -399,8 +399,8 @@ class LocalFrames:
                 break
             steps = fewer(steps, math.prod(s + 1 for s in steps) - 1)
             stencil = _Stencil.of(places, layers, steps)
-        shown = torch.empty((len(fragments), 3), device=device)
-        errors = torch.empty((len(fragments), 2), device=device)
+        shown = torch.empty((len(fragments), 3), dtype=torch.float32, device=device)
+        errors = torch.empty((len(fragments), 2), dtype=torch.float32, device=device)
         rank = basis.rank
         rows = self._at_knots(part, paint, stencil.keys)
         chunk = max(_ENTRIES // stencil.weight.shape[1], 1)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from traitbrdf.design.document import Varying
 from traitbrdf.design.effects import Palette
 from traitbrdf.formats.files import unknown_name
+from traitbrdf.host import steady_in_threads
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap, Light
 from traitbrdf.scene.scene import Scene
@@ -69,6 +70,7 @@ _LEARNT = 4  # knots of local paint that are computed while others wait
 _TICK = 0.2  # seconds between two images of `frames` while a scene is prepared
 
 
+@steady_in_threads
 class Viewer:
     """Prepares and draws a scene; `EditSession` adds materials that change.
 

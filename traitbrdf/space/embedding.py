@@ -26,6 +26,7 @@ import scipy  # its parts are loaded when they are first named
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.directions import fold_phi_d
+from traitbrdf.host import steady
 from traitbrdf.reflectance.brdf import (
     ALBEDO_ANGLES,
     HalfDiffGrid,
@@ -94,6 +95,7 @@ class _Tensors(NamedTuple):
     high: torch.Tensor
 
 
+@steady
 class BRDFEmbedding:
     """Log-mapped PCA of tabulated BRDFs.
 
@@ -338,7 +340,7 @@ class BRDFEmbedding:
         light = natural_light(self.grid_)
         given = torch.from_numpy(np.maximum(np.exp(logs) - np.float32(FLOOR), 0.0))
         seen = light @ given.T
-        black = light @ torch.full((self.grid_.size, 3), FLOOR)  # bounds the precision
+        black = light @ torch.full_like(given.T, FLOOR)  # bounds the precision
         precision = 1.0 / (_SEEN**2 * float((seen**2 + black**2).sum()))
 
         def misfit(z: Float64) -> tuple[float, Float32, Float32, Any]:

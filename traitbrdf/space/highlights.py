@@ -29,6 +29,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.compiled import CACHED
 from traitbrdf.reflectance.brdf import HalfDiffGrid
 
 Float32 = NDArray[np.float32]
@@ -190,7 +191,7 @@ class Profiles:
         return kept.reshape(3, -1), cells.reshape(3, -1), extra.reshape(3, -1), first
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHED, nogil=True)
 def _keep(x: Any, share: Any, grazing: Any, inner: Any, last: Any, core: Any) -> Any:
     """Correct profiles x (3, nodes, profiles).
 

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from traitbrdf.formats.files import artifact, unknown_name
+from traitbrdf.host import steady
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.space.embedding import BRDFEmbedding
 
 
+@steady
 class Library:
     """Named materials as points of an embedding.
 
@@ -113,12 +115,14 @@ class Library:
         return self._index[name]
 
 
+@steady
 @functools.lru_cache(maxsize=1)
 def default_embedding() -> BRDFEmbedding:
     """Load the embedding that the package ships, once."""
     return BRDFEmbedding.from_arrays(artifact())
 
 
+@steady
 @functools.lru_cache(maxsize=1)
 def default_library() -> Library:
     """Load the named materials that the package ships, once.

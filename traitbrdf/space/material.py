@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.host import steady
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.reflectance.models import Model
 from traitbrdf.reflectance.parameters import is_closed_form
@@ -20,6 +21,7 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
+@steady
 @dataclass(frozen=True, eq=False)
 class Material:
     """The material of one part; two are equal if reflectance and name are the same.

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.compiled import CACHED
 from traitbrdf.reflectance.descriptors import (
     DESCRIPTORS,
     LUMINANCE,
@@ -35,7 +36,7 @@ _SMALL = 1e-5  # step of forward differences along a coordinate, in standard dev
 # Compiled functions are loops over given arrays that Python calls one by one: one that calls others
 # would be compiled together with all of them, which takes longer. They keep Python's lock, since
 # they run for microseconds, and getting the lock back can take longer than that.
-compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+compiled = numba.njit(cache=CACHED, error_model="numpy", fastmath={"contract", "reassoc"})
 
 
 def _plain(array: Any) -> Any:

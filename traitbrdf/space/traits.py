@@ -1,10 +1,8 @@
 """Traits: words with which a designer describes and moves materials.
 
-A trait is a smooth score on coordinates. The shipped ones grade physical descriptors
-(`traitbrdf.reflectance.descriptors`) by how common their values are in the library, and add the
-grades up; a few decoded cells suffice to compute them. Straight traits are linear functions of the
-coordinates (Matusik et al. 2003). Scores are scaled so that the library's 10th percentile has 0 and
-its 90th has 1.
+A trait is a smooth score on coordinates. The shipped ones grade `reflectance.descriptors` by how
+common their values are in the library, and add the grades up. Straight traits are linear functions
+of the coordinates (Matusik et al. 2003). The library's 10th percentile has 0 and its 90th has 1.
 
 A move changes scores by given amounts along a curve and holds others (`traitbrdf.space.moves`). It
 ends at the wall of the gamut box, or where no member of the library is near (`Density`).
@@ -24,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from traitbrdf.formats.files import artifact, unknown_name
+from traitbrdf.host import steady
 from traitbrdf.reflectance.descriptors import descriptors
 from traitbrdf.space.definitions import (
     Definition,
@@ -74,6 +73,7 @@ _PARTS = ("names", "weights", "normals", "typical", "meanings", "synonyms")  # o
 _HOLE = 0.12  # log f by which the middle of a highlight may be darker than its brightest ring
 
 
+@steady
 class TraitSpace:
     """Scores and moves of the traits of one embedding.
 

@@ -269,7 +269,7 @@ def leading(
     squares, vectors = squares.flip(0)[:rank], vectors.flip(1)[:, :rank]
     kept = max(1, int((squares > enough**2 * squares[0].clamp_min(1e-30)).sum()))
     turn = vectors[:, :kept] * squares[:kept].clamp_min(1e-30).rsqrt()
-    basis = torch.empty((size, kept))
+    basis = torch.empty((size, kept), dtype=torch.float32)
     for piece in pieces:
         columns = images[piece].reshape(-1, count).double()
         basis[piece] = (columns @ turn).float()

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from traitbrdf.compiled import CACHED
+
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 f32 = np.float32
@@ -51,7 +53,7 @@ def kriging(
     return near, weights
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=CACHED, nogil=True)
 def interpolate_nodes(
     out: Any, shown: Any, near: Any, weights: Any, columns: Any, slopes: Any
 ) -> None:
@@ -85,7 +87,7 @@ def interpolate_nodes(
             out[p, c] = max(sharp, f32(0.0))
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+@numba.njit(parallel=True, cache=CACHED, error_model="numpy", nogil=True)
 def kriging_weights(out: Any, points: Any, at: Any, near: Any) -> None:
     """Solve for the weights of ordinary kriging with the variogram d^1.5.
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from traitbrdf.compiled import CACHED
 from traitbrdf.transport.arrays import (
     QuadratureSettings,
     Questions,
@@ -106,7 +107,7 @@ class _Row(NamedTuple):
     touched: Any
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHED, nogil=True)
 def cut_ranges(child: Any, split: Any) -> Any:
     """Find the cut through a tree, and the range of cut nodes under every node.
 
@@ -158,7 +159,7 @@ def cut_ranges(child: Any, split: Any) -> Any:
     return first, last, cut[:found].copy()
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=CACHED, nogil=True)
 def inherit(
     bits: Any, normals: Any, toward: Any, known: Any, around: Any, least: Any, sharp: Any
 ) -> None:
@@ -202,7 +203,7 @@ def inherit(
             bits[p, d] = value
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=CACHED, nogil=True)
 def pack_bits(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: Any) -> None:
     """Pack visibility bits into the three sets of `VisibilityMasks`.
 
@@ -234,7 +235,7 @@ def pack_bits(bits: Any, neighbours: Any, hidden: Any, unseen: Any, unhidden: An
                 unhidden[p, d >> 6] |= one
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=CACHED, inline="always")
 def _some(words: Any, row: Any, start: Any, stop: Any, wanted: Any) -> Any:
     """Return whether any of the bits `start` to `stop - 1` of a row equals `wanted`."""
     ones = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -250,7 +251,7 @@ def _some(words: Any, row: Any, start: Any, stop: Any, wanted: Any) -> Any:
     return found
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=CACHED, nogil=True)
 def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, share: Any) -> None:
     """Measure how differently the corners of lattice cells are lit.
 
@@ -290,7 +291,7 @@ def disagreement(out: Any, bits: Any, cells: Any, normals: Any, toward: Any, sha
         out[p] = math.sqrt(unlike) / total
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=CACHED, nogil=True)
 def interpolate_images(out: Any, coarse: Any, corners: Any, weights: Any) -> None:
     """Add images that are interpolated between the fragments where they were computed.
 
@@ -310,7 +311,7 @@ def interpolate_images(out: Any, coarse: Any, corners: Any, weights: Any) -> Non
                         out[p, c, j] += w * coarse[q, c, j]
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=CACHED, inline="always")
 def _push_texels(cells: Any, top: Any, box: Any, t_step: Any, f_step: Any) -> Any:
     """Push the texels of a leaf on the stack `cells`, and return the new top.
 
@@ -327,7 +328,7 @@ def _push_texels(cells: Any, top: Any, box: Any, t_step: Any, f_step: Any) -> An
     return top
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=CACHED, inline="always")
 def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> Any:
     """Push the quarters of the piece just above the stack's top, and return the new top."""
     tm, fm = f32(0.5) * (t0 + t1), f32(0.5) * (f0 + f1)
@@ -342,7 +343,7 @@ def _push_quarters(cells: Any, top: Any, t0: Any, t1: Any, f0: Any, f1: Any) -> 
     return top
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=CACHED, inline="always")
 def _turned(angle: Any, sine: Any, cosine: Any) -> Any:
     """Return sine and cosine of the sum of an angle and a small one (at most 0.4 radians)."""
     x = angle * angle
@@ -351,7 +352,7 @@ def _turned(angle: Any, sine: Any, cosine: Any) -> Any:
     return sine * c + cosine * s, cosine * c - sine * s
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+@numba.njit(cache=CACHED, error_model="numpy", fastmath=True, nogil=True)
 def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) -> Any:
     """Estimate the irradiance, all colours together, to some percent.
 
@@ -376,7 +377,7 @@ def _coarse_irradiance(n: Any, place: Any, moment: Any, child: Any, stack: Any) 
     return max(total, f32(1e-30))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+@numba.njit(cache=CACHED, error_model="numpy", fastmath=True, nogil=True)
 def _walk(
     leaves: Any, ask: Any, answers: Any, frame: _Frame, tree: TreeArrays, masks: VisibilityMasks,
     wanted: Any, pending: _Pending,
@@ -573,7 +574,7 @@ def _walk(
     return count, asked
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=CACHED, inline="always")
 def _arctan(y: Any, x: Any) -> Any:
     """Return atan2 in the first quadrant, to 2e-6 of the angle (Abramowitz & Stegun 4.4.49)."""
     t = min(x, y) / max(max(x, y), f32(1e-30))
@@ -590,7 +591,7 @@ def _arctan(y: Any, x: Any) -> Any:
     return a if y <= x else f32(0.5 * math.pi) - a
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+@numba.njit(cache=CACHED, error_model="numpy", fastmath=True, nogil=True)
 def _stencils(sample: _Sample, leaves: Any, count: Any, tables: Tables, stencil: _Stencil) -> None:
     """Set the cells and interpolation weights of the first `count` leaves of a sample.
 
@@ -655,7 +656,7 @@ def _stencils(sample: _Sample, leaves: Any, count: Any, tables: Tables, stencil:
         place[6, q] = max(e2, f32(0.0)) * up
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+@numba.njit(cache=CACHED, error_model="numpy", fastmath=True, nogil=True)
 def _collect(
     whole: _Row,
     found: Any,
@@ -706,7 +707,7 @@ def _collect(
     return found
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=True, nogil=True)
+@numba.njit(cache=CACHED, error_model="numpy", fastmath=True, nogil=True)
 def _release(out: Any, whole: _Row, found: Any, shown: Tables) -> None:
     """Add a row, or its radiance under tables, to `out`; then clear the row.
 
@@ -743,7 +744,7 @@ def _release(out: Any, whole: _Row, found: Any, shown: Tables) -> None:
                 row[m, c] = f32(0.0)
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+@numba.njit(parallel=True, cache=CACHED, error_model="numpy", nogil=True)
 def one_leaf(
     out: Any, starts: Any, normals: Any, views: Any, share: Any, leaves: Any, tables: Tables
 ) -> None:
@@ -773,7 +774,7 @@ def one_leaf(
             _release(out[f], row, found, tables)
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy", nogil=True)
+@numba.njit(parallel=True, cache=CACHED, error_model="numpy", nogil=True)
 def shade_rows(
     out: Any, asked: Any, questions: Questions, bundles: Any, tree: TreeArrays,
     masks: VisibilityMasks, settings: QuadratureSettings, tables: Tables,

@@ -76,7 +76,8 @@ def blurred(environment: EnvironmentMap) -> list[torch.Tensor]:
     """
     image = torch.from_numpy(environment.image.copy()).permute(2, 0, 1)
     rows = image.shape[1]
-    area = torch.sin((torch.arange(rows) + 0.5) * (math.pi / rows))[None, :, None]
+    middle = torch.arange(rows, dtype=torch.float32) + 0.5
+    area = torch.sin(middle * (math.pi / rows))[None, :, None]
     levels = []
     for most in ROWS:
         few = min(most, rows)

@@ -242,8 +242,10 @@ class Transport:
             material alone
         """
         count = tables.shape[2]
-        deviation = torch.zeros((len(ranks), len(self.parts), count), device=self.device)
-        level = torch.zeros((len(self.parts), count), device=self.device)
+        deviation = torch.zeros(
+            (len(ranks), len(self.parts), count), dtype=torch.float32, device=self.device
+        )
+        level = torch.zeros((len(self.parts), count), dtype=torch.float32, device=self.device)
         for basis in self.bases:
             if self.fixed.intersection(basis.parts):
                 continue
@@ -534,7 +536,9 @@ class Transport:
         scale = torch.where(keep, 1.0 / torch.where(keep, squares, 1.0), 0.0)
         inverse = (vectors * scale) @ vectors.T
         solve = (inverse @ sampled.T * (damping[at] * weight)).float()
-        rows = torch.zeros((len(exact), solve.shape[0] + exact.shape[1], self.grid.size))
+        rows = torch.zeros(
+            (len(exact), solve.shape[0] + exact.shape[1], self.grid.size), dtype=torch.float32
+        )
         rows[:, solve.shape[0] :] = torch.from_numpy(exact)
         seen = (rows != 0.0).any(dim=0).any(dim=0)
         for i in range(0, len(chosen), 64):
@@ -566,7 +570,11 @@ class Transport:
             basis.place = place[basis.cells]
             if len(basis.cells) > 0.8 * len(self.cells):
                 # some more zeros in the rows are cheaper than a look-up
-                wide = torch.zeros((*basis.rows.shape[:2], len(self.cells)), device=self.device)
+                wide = torch.zeros(
+                    (*basis.rows.shape[:2], len(self.cells)),
+                    dtype=torch.float32,
+                    device=self.device,
+                )
                 wide[:, :, basis.place] = basis.rows
                 basis.rows, basis.place = wide, None
                 basis.cells = torch.nonzero(seen)[:, 0]
@@ -618,7 +626,7 @@ class Transport:
         basis = known.basis.cpu().float() * damping[:, None]
         if self.dtype != torch.float32:  # `stored` scaled its columns
             basis /= basis.norm(dim=0).clamp_min(1e-30)
-        fresh = torch.zeros((len(basis), 3))
+        fresh = torch.zeros((len(basis), 3), dtype=torch.float32)
         fresh[mine.span] = radiance.cpu() * damping[mine.span, None]
         basis = extended(basis, fresh)
         exact = np.zeros((*known.probes.shape[:2], self.grid.size), np.float32)
@@ -756,7 +764,7 @@ class Transport:
         self._check_table(table)
         known = self.parts[part]
         if known is None:
-            return torch.zeros((0, 3), device=self.device)
+            return torch.zeros((0, 3), dtype=torch.float32, device=self.device)
         basis = self.bases[known.group]
         coefficients = per_colour(basis.projection, basis.at_cells(table))
         return basis.images(known.span, coefficients)
@@ -811,7 +819,7 @@ class Transport:
         self._check_table(table)
         known = self.parts[part]
         if known is None:
-            empty = torch.zeros((0, 3), device=self.device)
+            empty = torch.zeros((0, 3), dtype=torch.float32, device=self.device)
             return PartFrame(empty, 0.0, 0.0)
         basis = self.bases[known.group]
         coefficients, exact = self._project(known, table, alone)
