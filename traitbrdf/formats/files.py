@@ -8,6 +8,7 @@ import functools
 import os
 import secrets
 import shutil
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -188,12 +189,22 @@ def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
     """
     source = Path(path) if isinstance(path, (str, PathLike)) else path
     try:
-        with source.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except FileNotFoundError:
+        with source.open("rb") as file:
+            with zipfile.ZipFile(file) as members:
+                size = sum(one.compress_size for one in members.infolist())
+                needed = sum(one.file_size for one in members.infolist())
+            if not fits_in_memory(needed, size):
+                raise FormatError(
+                    str(path), "arrays that its size can hold", f"{size} bytes for {needed}"
+                )
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as data:
+                return {name: data[name] for name in data.files}
+    except (FileNotFoundError, FormatError):
         raise
-    except (ValueError, TypeError, OSError, EOFError, KeyError, AttributeError,
-            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+    except (ValueError, TypeError, OSError, EOFError, KeyError, AttributeError, MemoryError,
+            SyntaxError, RuntimeError, NotImplementedError, zipfile.BadZipFile,
+            zlib.error, struct.error) as error:  # fmt: skip
         raise FormatError(str(path), "a file of named arrays (.npz)", str(error)) from error
 
 

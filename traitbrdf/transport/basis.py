@@ -294,6 +294,7 @@ def fit_rows(
         return np.arange(size), np.ones(size)
     pieces = torch.split(basis, 8192)
     leverage = torch.cat([(piece.double() ** 2).sum(dim=1) for piece in pieces]).numpy()
+    leverage = np.nan_to_num(leverage, nan=0.0, posinf=0.0)  # of a view where all is dark
     chance = 0.5 * leverage / max(leverage.sum(), 1e-30) + 0.5 / size
     chance /= chance.sum()
     chosen, times = np.unique(rng.choice(size, count, p=chance), return_counts=True)

@@ -350,7 +350,8 @@ class NodeTransport:
             drawn = min(max(most, 1) - have, int(np.count_nonzero(whole)))
             if drawn > 0:
                 # what is drawn has no order among places: any few of them are spread evenly
-                chosen = self._rng.choice(size, drawn, replace=False, p=whole / whole.sum())
+                chance = whole / whole.max()  # near darkness a sum of squares may underflow
+                chosen = self._rng.choice(size, drawn, replace=False, p=chance / chance.sum())
                 for part, span in zip(group, spans, strict=True):
                     at = chosen + spans[0].start
                     fresh[part] = at[(at >= span.start) & (at < span.stop)]
