@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "traitbrdf"
 
 FLOORS = (
-    ("compiled", "directions", "formats"),
+    ("compiled", "directions", "formats", "host"),
     ("reflectance",),
     ("scene", "recipes"),
     ("transport", "reference"),
@@ -35,10 +35,11 @@ LONGER = {"reflectance/models.py"}
 """Greatest length of a file, and the exception: a list of many things of one kind."""
 
 HOMES = {
-    "OpenEXR": {"formats/images.py"},
+    "OpenEXR": {"formats/exr.py", "formats/images.py"},
+    "mapbox_earcut": {"formats/polygons.py"},
+    "DracoPy": {"formats/gltf.py"},
     "sklearn": {"space/fitting.py", "space/definitions.py"},
     "embreex": {"scene/shapes.py"},
-    "trimesh": {"scene/shapes.py", "scene/meshes.py"},
     "numba": {
         "reflectance/descriptors.py", "scene/trails.py", "space/highlights.py", "space/scores.py",
         "transport/interpolation.py", "transport/kernels.py",
