@@ -20,8 +20,8 @@ from traitbrdf.formats.files import FormatError
 from traitbrdf.formats.images import write_exr
 from traitbrdf.reflectance.measured import rgl_fields
 
-COUNT = int(os.environ.get("TRAITBRDF_MUTATIONS", "300"))
-"""Mutations of each kind of file; 10,000 took 20 minutes in all."""
+COUNT = int(os.environ.get("TRAITBRDF_MUTATIONS", "200"))
+"""Mutations of each kind of file."""
 
 
 def exr(path: Path) -> None:

@@ -408,3 +408,50 @@ def test_the_size_of_the_world_does_not_matter(scale):
         # a shadow ray that grazes an edge may pass on either side
         close = np.isclose(shown, expected, rtol=1e-3, atol=1e-6).all(axis=(1, 2))
         assert np.mean(close) > 0.995
+
+
+# -- darkness -------------------------------------------------------------------------------------
+
+
+def closed() -> Mesh:
+    """A cube of 12 triangles."""
+    corner = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    sides = corner[faces]
+    facet = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
+    normals = np.repeat(facet[:, None], 3, axis=1)
+    return Mesh(corner, faces, normals, np.zeros(12, int), ("cube",))
+
+
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+@pytest.mark.parametrize("light", [1.0, 1e-30, 0.0])
+def test_a_camera_inside_sees_black_and_goes_on(shape, light):
+    environment = EnvironmentMap.sky(rows=16).scaled(light)
+    made = closed() if shape == "cube" else sphere()
+    inside = Camera.orbit(20, 10, zoom=40.0)
+    edit = EditSession(Scene(made, environment, camera=inside, size=64), cache=False)
+    edit.assign(shape, "red-rubber")
+    brightest = float(environment.image.max())
+    for _ in range(2):
+        frame = edit.render()
+        assert np.isfinite(frame).all()
+        assert frame.min() >= 0.0 and frame.max() <= 1e-5 * brightest
+        edit.move(shape, shiny=0.3)
+        edit.render(exact=False)
+        edit.look(camera=Camera.orbit(50, 10, zoom=40.0))
+    assert math.isfinite(edit.report()["frame_error"])
+    edit.look(camera=Camera.orbit(20, 10))  # out again
+    assert edit.render().max() > 0.0 or light == 0.0
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-38])
+def test_near_zero_light_scales_the_frame(factor):
+    frames = []
+    for scale in (1.0, factor):
+        environment = EnvironmentMap.sky(rows=16).scaled(scale)
+        scene = Scene(sphere(), environment, camera=Camera.orbit(20, 10), size=32)
+        edit = EditSession(scene, cache=False)
+        edit.assign("sphere", "red-rubber")
+        frames.append(edit.render().astype(np.float64) / scale)
+    np.testing.assert_allclose(frames[1], frames[0], rtol=0.02, atol=1e-3 * frames[0].max())

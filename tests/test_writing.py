@@ -51,7 +51,7 @@ def test_merl_files_look_like_the_table(tmp_path, shared_data, name):
     environment = tb.EnvironmentMap.read(shared_data / "envmaps" / "studio.exr")
     small = environment.image.reshape(32, 8, 64, 8, 3).mean(axis=(1, 3))
     scene = tb.Scene(tb.sphere(), tb.EnvironmentMap(small), size=16)
-    some = np.arange(0, len(scene.pixels), 8)
+    some = np.arange(3, len(scene.pixels), 16)
     LIBRARY[name].write(tmp_path / "a.binary")
     read = tb.TabulatedBRDF.read(tmp_path / "a.binary")
     shown, expected = (
