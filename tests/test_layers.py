@@ -24,7 +24,7 @@ FLOORS = (
     ("space",),
     ("design",),
     ("session",),
-    ("bench", "studio"),
+    ("bench", "studio", "testing"),
     ("cli",),
 )
 """Rooms and single modules; each imports only from earlier floors."""
