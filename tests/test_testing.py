@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 import traitbrdf as tb
+from traitbrdf.cli import main
+from traitbrdf.formats.images import read_image, write_exr
 from traitbrdf.testing import assert_frame, assert_physical, assert_same_look, assert_traits
 
 LIBRARY = tb.default_library()
@@ -85,3 +89,52 @@ def test_frames():
     assert_frame(edit, error=0.01, pixels=12)
     with pytest.raises(AssertionError, match=r"off by 0\.\d\d %, more than 0 %: most at pixel \("):
         assert_frame(edit, error=0.0, pixels=12)
+
+
+# -- files and the command line -------------------------------------------------------------------
+
+
+def test_validate_names_each_fault_in_a_line(tmp_path, capsys):
+    good, odd, cut = tmp_path / "good.npz", tmp_path / "odd.npz", tmp_path / "cut.exr"
+    bright = tmp_path / "bright.npz"
+    LIBRARY["red-rubber"].write(good)
+    changed(LIBRARY["red-rubber"], lambda v: np.multiply(v, 9.0, out=v)).write(bright)
+    odd.write_bytes(good.read_bytes()[:-40])
+    cut.write_bytes(b"\x76\x2f\x31\x01")
+    mesh = tmp_path / "a.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert main(["validate", str(good), str(mesh)]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["validate", str(good), str(odd), str(bright), str(cut), str(mesh)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [str(odd), str(bright), str(cut)]
+    assert "more light than arrives: albedo" in lines[1]
+    assert main(["validate", "--json", str(good), str(cut)]) == 1
+    records = json.loads(capsys.readouterr().out)
+    assert [len(r["faults"]) for r in records] == [0, 1]
+    assert main(["validate", str(tmp_path / "a.doc")]) == 1
+    assert "unknown kind of file '.doc'" in capsys.readouterr().err
+    assert main(["validate", str(tmp_path / "none.exr")]) == 1
+    assert "no such file" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("suffix", [".binary", ".bsdf", ".npz"])
+def test_convert_materials(tmp_path, capsys, suffix):
+    first, second = tmp_path / f"a{suffix}", tmp_path / "b.npz"
+    assert main(["convert", "red-rubber", str(first)]) == 0
+    assert main(["convert", str(first), str(second)]) == 0
+    assert_same_look(LIBRARY["red-rubber"], tb.TabulatedBRDF.read(second))
+    assert "b.npz: TabulatedBRDF" in capsys.readouterr().out
+
+
+def test_convert_maps_and_refusals(tmp_path, capsys):
+    pixels = np.random.default_rng(0).random((4, 8, 3)).astype(np.float32)
+    write_exr(tmp_path / "a.exr", pixels)
+    assert main(["convert", str(tmp_path / "a.exr"), str(tmp_path / "b.exr")]) == 0
+    np.testing.assert_array_equal(read_image(tmp_path / "b.exr"), pixels)
+    assert main(["convert", str(tmp_path / "a.exr"), str(tmp_path / "b.png")]) == 0
+    assert main(["convert", str(tmp_path / "a.exr"), str(tmp_path / "b.npz")]) == 1
+    assert "expected a name in .exr or .png" in capsys.readouterr().err
+    assert main(["convert", "red-rubber", str(tmp_path / "b.txt")]) == 1
+    assert "expected a name in .binary, .bsdf, .npz" in capsys.readouterr().err
+    assert not (tmp_path / "b.txt").exists()

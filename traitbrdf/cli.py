@@ -27,8 +27,8 @@ from traitbrdf.bench.records import NAMES, ON_REQUEST
 from traitbrdf.design.strokes import follow
 from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.formats.files import unknown_name
-from traitbrdf.formats.images import write_exr, write_png
-from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, Reflectance
+from traitbrdf.formats.images import read_image, write_exr, write_png
+from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, SUFFIXES, Reflectance
 from traitbrdf.scene.shapes import Shape
 from traitbrdf.studio import need_packages
 
@@ -151,6 +151,29 @@ def _parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="list what the package ships, or what a file holds")
     info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
     info.set_defaults(run=_info)
+
+    convert = commands.add_parser("convert", help="read a material or a map and write another file")
+    convert.add_argument(
+        "source", help="name of a library material, .binary, .bsdf, .npz, .exr, .hdr or .pic"
+    )
+    convert.add_argument(
+        "target", type=Path, help="material: .binary, .bsdf or .npz; map: .exr or .png"
+    )
+    convert.set_defaults(run=_convert)
+
+    validate = commands.add_parser(
+        "validate", help="say what is wrong with files, a line each; the exit status is 1 then"
+    )
+    validate.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE",
+        help="materials, maps, meshes and designs, by their suffixes",
+    )  # fmt: skip
+    validate.add_argument(
+        "--to", type=float, default=80.0, metavar="DEGREES",
+        help="greatest view angle at which materials must keep energy (%(default)s)",
+    )  # fmt: skip
+    validate.add_argument("--json", action="store_true", help="write a list of records instead")
+    validate.set_defaults(run=_validate)
 
     ahead = commands.add_parser(
         "compile", help="compile what the first session would wait for; once, half a minute"
@@ -488,12 +511,51 @@ def _render(given: argparse.Namespace) -> int:
 
 def _material(name: str) -> str | Reflectance:
     suffix = Path(name).suffix.lower()
-    if suffix == ".binary":
+    if suffix in (".binary", ".npz"):
         return tb.TabulatedBRDF.read(name)
     if suffix == ".bsdf":
         return tb.MeasuredBRDF.read(name)
     tb.default_library().index(name)
     return name
+
+
+def _convert(given: argparse.Namespace) -> int:
+    target: Path = given.target
+    kind = target.suffix.lower()
+    if Path(given.source).suffix.lower() in (".exr", ".hdr", ".pic"):
+        if kind not in (".exr", ".png"):
+            raise ValueError(f"target: expected a name in .exr or .png, got {str(target)!r}")
+        image = read_image(given.source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _write(target, image)
+        print(f"{target}: {image.shape[0]} rows by {image.shape[1]} columns")
+        return 0
+    if kind not in SUFFIXES:
+        raise ValueError(f"target: expected a name in {', '.join(SUFFIXES)}, got {str(target)!r}")
+    brdf = _material(given.source)
+    if isinstance(brdf, str):
+        brdf = tb.default_library()[brdf]
+    if not isinstance(brdf, tb.TabulatedBRDF):
+        grid = tb.HalfDiffGrid.merl() if kind == ".binary" else tb.default_embedding().grid_
+        brdf = tb.TabulatedBRDF.from_model(brdf, grid, Path(given.source).stem)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    brdf.write(target)
+    print(f"{target}: {brdf!r}")
+    return 0
+
+
+def _validate(given: argparse.Namespace) -> int:
+    # imports the reference integrator, which most commands do not need
+    from traitbrdf.testing import file_faults
+
+    records = [{"file": str(f), "faults": file_faults(f, given.to)} for f in given.files]
+    if given.json:
+        print(json.dumps(records, indent=1))
+    else:
+        for record in records:
+            for fault in record["faults"]:
+                print(f"{record['file']}: {fault}")
+    return int(any(record["faults"] for record in records))
 
 
 def _angles(given: argparse.Namespace) -> int:

@@ -7,7 +7,10 @@ ValueError or TypeError, as everywhere.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,16 +18,21 @@ from numpy.typing import ArrayLike, NDArray
 from traitbrdf import reference
 from traitbrdf.directions import from_half_diff_angles
 from traitbrdf.formats.display import exposure_of
+from traitbrdf.formats.files import FormatError, unknown_name
 from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF, albedo_of
 from traitbrdf.reflectance.descriptors import cielab
+from traitbrdf.reflectance.measured import MeasuredBRDF
 from traitbrdf.scene.lights import EnvironmentMap
+from traitbrdf.scene.meshes import load_mesh
 from traitbrdf.space.library import default_embedding
 from traitbrdf.space.traits import default_traits
 
 if TYPE_CHECKING:
     from traitbrdf.session.editing import EditSession
 
-__all__ = ["assert_frame", "assert_physical", "assert_same_look", "assert_traits"]
+__all__ = [
+    "assert_frame", "assert_physical", "assert_same_look", "assert_traits", "file_faults",
+]  # fmt: skip
 
 Float64 = NDArray[np.float64]
 
@@ -258,3 +266,51 @@ def assert_frame(edit: EditSession, error: float = 0.01, pixels: int = 60, seed:
             f"({x[worst]}, {y[worst]}), {frame[y[worst], x[worst]].tolist()} where it should be "
             f"{np.round(exact[worst], 4).tolist()}"
         )
+
+
+def file_faults(path: str | PathLike[str], to: float = 80.0) -> list[str]:
+    """Return what is wrong with a file: nothing if it can be read and is what it should be.
+
+    Materials (.binary, .bsdf, .npz) are read and must be physical, maps (.exr, .hdr, .pic) and
+    meshes (.obj, .ply, .gltf, .glb) must be read, and designs (.tbr) must load.
+
+    Parameters
+    ----------
+    path : path-like
+    to : float
+        Greatest view angle in degrees at which energy is asked for: measurements end near 80.
+
+    Raises
+    ------
+    ValueError
+        On another suffix.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _CHECKS:
+        raise ValueError(unknown_name("kind of file", suffix, tuple(_CHECKS)))
+    try:
+        found = _CHECKS[suffix](path)
+        if suffix in MATERIALS:
+            angles = ENERGY_ANGLES[math.radians(to) + 1e-9 >= ENERGY_ANGLES]
+            assert_physical(found, angles=angles, reciprocity=0.02)
+    except (FormatError, OSError, AssertionError, ValueError) as error:
+        return [" ".join(str(error).removeprefix(f"{path}: ").split())]
+    return []
+
+
+def _design(path: str | PathLike[str]) -> object:
+    # imports sessions and torch, which other files do without
+    from traitbrdf.session.editing import EditSession
+
+    return EditSession.load(path)
+
+
+MATERIALS = (".binary", ".bsdf", ".npz")
+"""Suffixes of files of materials."""
+
+_CHECKS: dict[str, Callable[[Any], Any]] = {
+    ".binary": TabulatedBRDF.read, ".npz": TabulatedBRDF.read, ".bsdf": MeasuredBRDF.read,
+    ".tbr": _design,
+    **dict.fromkeys((".exr", ".hdr", ".pic"), EnvironmentMap.read),
+    **dict.fromkeys((".obj", ".ply", ".gltf", ".glb"), load_mesh),
+}  # fmt: skip
