@@ -20,10 +20,16 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from traitbrdf.formats.files import FormatError, PathName, file_size, fits_in_memory, open_binary
+from traitbrdf.formats.files import (
+    MOST_PIXELS,
+    FormatError,
+    PathName,
+    file_size,
+    fits_in_memory,
+    open_binary,
+)
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MAGIC = b"\x76\x2f\x31\x01"
 
@@ -38,8 +44,6 @@ _SIZES = {
     "envmap": 1, "tiledesc": 9, "int": 4, "double": 8, "v3f": 12, "v2i": 8, "v3i": 12, "m33f": 36,
     "m44f": 64, "rational": 8, "timecode": 8, "keycode": 28,
 }  # fmt: skip
-
-_MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that asks for more counts as damaged
 
 
 @dataclass(frozen=True)
@@ -125,10 +129,10 @@ def _displayed(path: PathName, stored: Float32, part: _Part) -> Float32:
     x0, y0, x1, y1 = part.display
     width, height = x1 - x0 + 1, y1 - y0 + 1
     if not (
-        width > 0 and height > 0 and width * height <= _MOST_PIXELS
+        width > 0 and height > 0 and width * height <= MOST_PIXELS
         and fits_in_memory(12 * width * height, stored.nbytes)
     ):  # fmt: skip
-        raise FormatError(path, f"at most {_MOST_PIXELS} pixels", f"a {width} x {height} image")
+        raise FormatError(path, f"at most {MOST_PIXELS} pixels", f"a {width} x {height} image")
     shown = np.zeros((height, width, 3), np.float32)
     left, top = part.data[0] - x0, part.data[1] - y0
     rows = slice(max(top, 0), max(min(top + len(stored), height), 0))
@@ -248,8 +252,8 @@ def _part(path: PathName, attributes: dict[str, tuple[str, bytes]], tiled: bool)
         raise FormatError(path, "an OpenEXR 2 image of flat pixels", "deep data")
     x0, y0, x1, y1 = data = struct.unpack("<4i", window)
     width, height = x1 - x0 + 1, y1 - y0 + 1
-    if width < 1 or height < 1 or width * height > _MOST_PIXELS:
-        raise FormatError(path, f"at most {_MOST_PIXELS} pixels", f"a {width} x {height} image")
+    if width < 1 or height < 1 or width * height > MOST_PIXELS:
+        raise FormatError(path, f"at most {MOST_PIXELS} pixels", f"a {width} x {height} image")
     display = of("displayWindow", "box2i")
     chromaticities, envmap = of("chromaticities", "chromaticities"), of("envmap", "envmap")
     tiles = of("tiles", "tiledesc")

@@ -125,6 +125,9 @@ def file_size(file: BinaryIO) -> int:
     return os.fstat(file.fileno()).st_size
 
 
+MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that asks for more counts as damaged
+
+
 def fits_in_memory(needed: int, size: int) -> bool:
     """Return whether a file may become so many bytes: 128 MiB, or 20 times its own size.
 

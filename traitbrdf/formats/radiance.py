@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from traitbrdf.formats.files import FormatError, PathName, fits_in_memory
+from traitbrdf.formats.files import MOST_PIXELS, FormatError, PathName, fits_in_memory
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-
-_MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that asks for more counts as damaged
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,8 @@ def decode_radiance(path: PathName, data: bytes) -> RadiancePicture:
         shown = data[position : position + 40].decode("latin-1")
         raise FormatError(path, "a resolution line like '-Y 256 +X 512'", repr(shown))
     lines, length = int(counts[0]), int(counts[1])
-    if lines < 1 or length < 1 or lines * length > _MOST_PIXELS:
-        raise FormatError(path, f"1 to {_MOST_PIXELS} pixels", f"a {lines} x {length} image")
+    if lines < 1 or length < 1 or lines * length > MOST_PIXELS:
+        raise FormatError(path, f"1 to {MOST_PIXELS} pixels", f"a {lines} x {length} image")
     # at best a run holds 127 pixels of a channel, or 2^24 pixels in the old format
     enough = (len(data) - end) * (1 << 22) >= lines * length
     if not enough or not fits_in_memory(4 * lines * length, len(data)):
