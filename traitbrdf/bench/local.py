@@ -70,13 +70,18 @@ def _stroke(edit: EditSession, points: Sequence[tuple[float, float]], radius: fl
 def _samples(
     edit: EditSession, where: str, effect: Effect, points: Sequence[tuple[float, float]]
 ) -> list[float]:
-    """Paint a stroke sample by sample, as the canvas does; return milliseconds to each frame."""
+    """Paint a stroke sample by sample, as the canvas does; return milliseconds to each frame.
+
+    The canvas keeps the stroke of a hand that is down and extends it by each sample.
+    """
+    side, stroke = edit.scene.height, _stroke(edit, points[:1], 0.125)
     times = []
-    for count in range(2, len(points) + 1):
+    for count, (x, y) in enumerate(points[1:]):
         start = time.perf_counter()
-        if count > 2:
+        stroke = stroke.extended([(x * side, y * side)])
+        if count:
             edit.undo()
-        edit.paint(_stroke(edit, points[:count], 0.125), effect, where=where)
+        edit.paint(stroke, effect, where=where)
         edit.render(exact=False)
         times.append(1e3 * (time.perf_counter() - start))
     return times

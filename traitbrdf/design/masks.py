@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, Self, TypeAlias
 
 from traitbrdf.design.strokes import Stroke
@@ -76,7 +77,7 @@ class Parts:
         names = [target] if isinstance(target, str) else dict.fromkeys(target)
         return cls(tuple((name, 1.0) for name in names))
 
-    @property
+    @cached_property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts."""
         return tuple(name for name, _ in self.weights)
@@ -171,7 +172,7 @@ class Local:
             if name not in self.whole:
                 raise ValueError(unknown_name("part", name, self.whole))
 
-    @property
+    @cached_property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts where the weight may be above 0."""
         painted = {name for one in self.strokes if not one.erase for name in one.parts}

@@ -149,7 +149,7 @@ class Profiles:
         (3, cells) array or tensor, as given; a tensor is differentiable
         """
         if isinstance(logs, np.ndarray):
-            return self.sources(logs)[0]
+            return self._found(logs)[0].reshape(3, -1)
         import torch  # importing it takes a second, which arrays need not wait for
 
         found = self.sources(logs.detach().cpu().numpy())
@@ -183,12 +183,14 @@ class Profiles:
         first : (3, n) int64
             The cell that each profile's trend starts from.
         """
-        x = np.ascontiguousarray(logs).reshape(3, *self.share.shape)
-        allowed = self.share, self.grazing, self.inner, self.last, self.core
-        kept, node, extra, top = _keep(x, *allowed)
+        kept, node, extra, top = self._found(logs)
         profile = np.arange(len(self.last))
         cells, first = (n.astype(np.int64) * len(profile) + profile for n in (node, top))
         return kept.reshape(3, -1), cells.reshape(3, -1), extra.reshape(3, -1), first
+
+    def _found(self, logs: NDArray[Any]) -> Any:
+        x = np.ascontiguousarray(logs).reshape(3, *self.share.shape)
+        return _keep(x, self.share, self.grazing, self.inner, self.last, self.core)
 
 
 @numba.njit(cache=CACHED, nogil=True)
