@@ -23,6 +23,7 @@ FLOORS = (
     ("pictures",),
     ("space",),
     ("design",),
+    ("export",),
     ("session",),
     ("bench", "studio", "testing"),
     ("cli",),

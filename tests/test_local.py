@@ -9,10 +9,10 @@ from sessions import over, same
 
 import traitbrdf as tb
 from traitbrdf import reference
+from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.scene.camera import Camera
 from traitbrdf.session.editing import EditSession
 from traitbrdf.session.local import fewer, lagrange
-from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.transport.blends import Shares
 
 ON = [(24.0, 26.0), (30.0, 30.0), (36.0, 30.0)]  # on the body of the small teapot

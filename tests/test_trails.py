@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from traitbrdf.design.masks import Brushed, Framing, Local
 from traitbrdf.design.strokes import Stroke, follow
+from traitbrdf.design.surface import SurfaceWeights, points_of, touched
 from traitbrdf.scene.camera import Camera
 from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.scene.shapes import sphere
 from traitbrdf.scene.teapot import teapot
 from traitbrdf.scene.trails import evenly, trail_of
-from traitbrdf.session.surface import SurfaceWeights, points_of, touched
 
 SKY = EnvironmentMap.sky(rows=16)
 LINE = [(30.0, 62.0), (52.0, 74.0), (85.0, 70.0)]

@@ -16,10 +16,10 @@ from traitbrdf.bench.transport import bench_scene
 from traitbrdf.design.effects import Assign, Effect, Move, Tint
 from traitbrdf.design.masks import Local
 from traitbrdf.design.strokes import Stroke
+from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.formats.display import exposure_of
 from traitbrdf.reflectance.descriptors import cielab
 from traitbrdf.session.editing import EditSession
-from traitbrdf.session.surface import SurfaceWeights
 
 Float64 = NDArray[np.float64]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -208,3 +209,15 @@ def write_png(path: PathName, srgb: ArrayLike) -> None:
     pixels = _as_image(srgb, np.uint8)
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+    """Return a PNG file (H, W, 3 or 4) of bytes, as other files contain them.
+
+    Parameters
+    ----------
+    pixels : (H, W, 3) or (H, W, 4) uint8
+    """
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    return file.getvalue()

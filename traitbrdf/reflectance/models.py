@@ -910,6 +910,34 @@ def _ggx_lobe(pair: _Pair, alpha: float) -> Float64:
     return np.asarray(ggx_distribution(pair.h, alpha) * 0.5 / (g_i + g_o))
 
 
+def ggx_lobe(wi: ArrayLike, wo: ArrayLike, alpha: float) -> Float64:
+    """Return D G_2 / (4 c_i c_o) (...), as in `GGX`, without its Fresnel term; 0 below the horizon.
+
+    Parameters
+    ----------
+    wi, wo : (..., 3) array_like
+        Local unit vectors.
+    alpha : float
+        Roughness, in (0, 1].
+    """
+    pair = _Pair(wi, wo)
+    return np.where(pair.visible, _ggx_lobe(pair, alpha), 0.0)
+
+
+def sheen_lobe(wi: ArrayLike, wo: ArrayLike, alpha: float) -> Float64:
+    """Return the lobe (...) of `Sheen` at weight 1, at any alpha in (0, 1]; 0 below the horizon.
+
+    Parameters
+    ----------
+    wi, wo : (..., 3) array_like
+        Local unit vectors.
+    alpha : float
+        Roughness.
+    """
+    pair = _Pair(wi, wo)
+    return np.where(pair.visible, _sheen_lobe(pair, alpha), 0.0)
+
+
 @dataclass(frozen=True)
 class GGX(_Lobe):
     """GGX microfacets with exact Fresnel: a conductor, or the surface of a dielectric (k = 0).
@@ -1003,6 +1031,13 @@ class Interference(_Lobe):
         return pair.result(_ggx_lobe(pair, self.alpha), fringes * np.array(self.k_s))
 
 
+def _sheen_lobe(pair: _Pair, alpha: float) -> Float64:
+    inverse = 1.0 / alpha
+    d = (2.0 + inverse) / (2.0 * math.pi) * pair.sin2_h ** (0.5 * inverse)
+    ci, co = pair.cos_i, pair.cos_o
+    return np.asarray(d / (4.0 * (ci + co - ci * co)))
+
+
 @dataclass(frozen=True)
 class Sheen(_Lobe):
     """Light scattered by fibres that stand off the surface: the bright rim of cloth.
@@ -1032,10 +1067,7 @@ class Sheen(_Lobe):
     def eval(self, wi: ArrayLike, wo: ArrayLike) -> Float64:
         """Return f_r (..., 3) in 1/sr for `wi` and `wo` (..., 3), as `Model.eval`."""
         pair = _Pair(wi, wo)
-        inverse = 1.0 / self.alpha
-        d = (2.0 + inverse) / (2.0 * math.pi) * pair.sin2_h ** (0.5 * inverse)
-        ci, co = pair.cos_i, pair.cos_o
-        return pair.result(d / (4.0 * (ci + co - ci * co)), self.k_s)
+        return pair.result(_sheen_lobe(pair, self.alpha), self.k_s)
 
 
 # ---------------------------------------------------------------------------------------------

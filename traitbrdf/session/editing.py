@@ -25,6 +25,8 @@ from traitbrdf.design.parameters import Parameters
 from traitbrdf.design.stack import Layers
 from traitbrdf.design.storage import SETTINGS, Stored, reading, write_design
 from traitbrdf.design.strokes import Stroke, region_weights
+from traitbrdf.design.surface import touched
+from traitbrdf.export.files import Exported, export_design
 from traitbrdf.host import steady_in_threads
 from traitbrdf.reflectance.brdf import Reflectance, TabulatedBRDF
 from traitbrdf.scene.camera import image_size
@@ -37,7 +39,6 @@ from traitbrdf.session.preparation import EXACT_ABOVE
 from traitbrdf.session.report import part_report, view_report
 from traitbrdf.session.settings import Asked, Settings
 from traitbrdf.session.sheets import Sheet
-from traitbrdf.session.surface import touched
 from traitbrdf.session.viewer import Viewer
 from traitbrdf.space.learning import Trait
 from traitbrdf.space.library import Library, default_library
@@ -837,6 +838,31 @@ class EditSession(Viewer):
             scene, document = self.scene, self._document.copy()
         settings = {name: getattr(self.settings, name) for name in SETTINGS}
         write_design(path, scene, document, settings)
+
+    def export(
+        self,
+        path: str | PathLike[str],
+        texture_size: int = 1024,
+        progress: Progress | None = None,
+    ) -> Exported:
+        """Write the design for another program; see `traitbrdf.export.files.export_design`.
+
+        Parameters
+        ----------
+        path : path-like
+            ``.glb`` (glTF 2.0), ``.mtlx`` (OpenPBR) or ``.py`` (a Mitsuba 3 scene).
+        texture_size : int
+            Texels on a side of the textures of parts that are painted locally.
+        progress : called with (stage, fraction done); may raise to cancel
+
+        Returns
+        -------
+        Exported
+            The files, and how far each exported material is off.
+        """
+        with self._lock:
+            scene, document = self.scene, self._document.copy()
+        return export_design(path, scene, document, self.embedding, texture_size, progress)
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> EditSession:

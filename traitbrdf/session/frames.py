@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf.design.document import Varying
+from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.scene.scene import Scene
 from traitbrdf.session.canvas import Canvas
 from traitbrdf.session.local import LocalFrames
 from traitbrdf.session.preparation import Preparation, Prepared
-from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.space.material import Material
 from traitbrdf.transport.basis import PartFrame
 from traitbrdf.transport.drafts import Draft

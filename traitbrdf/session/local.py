@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 
 from traitbrdf.design.document import Varying
+from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.scene.scene import Scene
-from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.material import Material
 from traitbrdf.transport.basis import PartFrame

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from traitbrdf.design.colours import Highlight
 from traitbrdf.design.document import Document
 from traitbrdf.design.masks import Local
+from traitbrdf.design.surface import SurfaceWeights, points_of
 from traitbrdf.scene.scene import Scene
-from traitbrdf.session.surface import SurfaceWeights, points_of
 from traitbrdf.space.material import Material
 from traitbrdf.space.traits import TraitSpace
 from traitbrdf.transport.transport import Transport

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from traitbrdf.design.document import Varying
 from traitbrdf.design.effects import Palette
+from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.host import steady_in_threads
 from traitbrdf.scene.camera import Camera
@@ -48,7 +49,6 @@ from traitbrdf.session.preparation import (
 )
 from traitbrdf.session.rendering import Renderer
 from traitbrdf.session.settings import Settings
-from traitbrdf.session.surface import SurfaceWeights
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
 from traitbrdf.space.material import Material

@@ -1,0 +1,1 @@
+"""A design shown live: preparation, cache, frames."""
