@@ -26,6 +26,7 @@ FLOORS = (
     ("export",),
     ("session",),
     ("bench", "studio", "testing"),
+    ("facts",),
     ("cli",),
 )
 """Rooms and single modules; each imports only from earlier floors."""

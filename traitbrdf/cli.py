@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import io
 import json
 import math
 import sys
@@ -17,7 +18,6 @@ import time
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from traitbrdf.design.strokes import follow
 from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.formats.images import read_image, write_exr, write_png
-from traitbrdf.reflectance.brdf import ALBEDO_ANGLES, SUFFIXES, Reflectance
+from traitbrdf.reflectance.brdf import SUFFIXES, Reflectance
 from traitbrdf.scene.shapes import Shape
 from traitbrdf.studio import need_packages
 
@@ -49,6 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     given = parser.parse_args(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # names of parts may have letters that a console cannot show
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         status: int = given.run(given)
     except KeyboardInterrupt:
@@ -149,7 +153,13 @@ def _parser() -> argparse.ArgumentParser:
     gallery.set_defaults(run=_gallery)
 
     info = commands.add_parser("info", help="list what the package ships, or what a file holds")
-    info.add_argument("file", nargs="?", type=Path, help=".binary, .bsdf, .exr, .hdr or .tbr")
+    info.add_argument(
+        "file", nargs="?", help="a material, map, mesh or design, or a library material's name"
+    )
+    info.add_argument(
+        "--picture", type=Path, metavar="PNG",
+        help="also draw it: a material as a lit sphere, its lobes and its albedo; a map",
+    )  # fmt: skip
     info.set_defaults(run=_info)
 
     convert = commands.add_parser("convert", help="read a material or a map and write another file")
@@ -160,6 +170,22 @@ def _parser() -> argparse.ArgumentParser:
         "target", type=Path, help="material: .binary, .bsdf or .npz; map: .exr or .png"
     )
     convert.set_defaults(run=_convert)
+
+    export = commands.add_parser("export", help="write a design for another program")
+    export.add_argument("design", type=Path, help="a design saved as .tbr")
+    export.add_argument(
+        "target", type=Path,
+        help="glTF .glb, MaterialX .mtlx (OpenPBR), or .py: a Mitsuba 3 scene with its tables",
+    )  # fmt: skip
+    export.add_argument(
+        "--texture-size", type=int, default=1024, metavar="TEXELS",
+        help="on a side, for parts that are painted locally (%(default)s)",
+    )  # fmt: skip
+    export.add_argument(
+        "--picture", type=Path, metavar="PNG",
+        help="also draw each part's material, and below it what the file says, as lit spheres",
+    )  # fmt: skip
+    export.set_defaults(run=_export)
 
     validate = commands.add_parser(
         "validate", help="say what is wrong with files, a line each; the exit status is 1 then"
@@ -544,6 +570,18 @@ def _convert(given: argparse.Namespace) -> int:
     return 0
 
 
+def _export(given: argparse.Namespace) -> int:
+    session = tb.EditSession.load(given.design)
+    given.target.parent.mkdir(parents=True, exist_ok=True)
+    with _Progress() as progress:
+        exported = session.export(given.target, given.texture_size, progress)
+    print(exported)
+    if given.picture is not None:
+        given.picture.parent.mkdir(parents=True, exist_ok=True)
+        write_png(given.picture, exported.picture(session.scene.environment))
+    return 0
+
+
 def _validate(given: argparse.Namespace) -> int:
     # imports the reference integrator, which most commands do not need
     from traitbrdf.testing import file_faults
@@ -657,32 +695,16 @@ def _info(given: argparse.Namespace) -> int:
         print(f"traits: {', '.join(space.names)}")
         print("materials: " + ", ".join(library.names))
         return 0
-    suffix = given.file.suffix.lower()
-    if suffix in (".binary", ".bsdf"):
-        brdf: Any = _material(str(given.file))
-        table = brdf if suffix == ".binary" else tb.TabulatedBRDF.from_model(brdf, embedding.grid_)
-        print(f"{given.file}: {table!r}")
-        for angle, albedo in zip(ALBEDO_ANGLES[::5], table.albedo(ALBEDO_ANGLES[::5]), strict=True):
-            print(f"albedo at {math.degrees(angle):2.0f} degrees: {np.round(albedo, 4).tolist()}")
-        scores = space.score(embedding.encode(table))
-        print("scores: " + ", ".join(f"{n} {s:.2f}" for n, s in scores.items()))
-    elif suffix in (".exr", ".hdr", ".pic"):
-        environment = tb.EnvironmentMap.read(given.file)
-        image = environment.image
-        up = environment.irradiance(np.array([0.0, 1.0, 0.0]))
-        print(f"{given.file}: {image.shape[0]} rows by {image.shape[1]} columns")
-        print(f"radiance: mean {image.mean():.4g}, largest {image.max():.4g}")
-        print(f"irradiance on the ground: {np.round(up, 4).tolist()}")
-        print(f"negative texels set to 0: {environment.clipped_texels}")
-    elif suffix == ".tbr":
-        session = tb.EditSession.load(given.file)
-        print(f"{given.file}: {session.scene!r}")
-        for part in session.scene.parts:
-            print(f"{part}: {session.material(part).name}")
-        print("\n".join(session.history))
-    else:
-        known = (".binary", ".bsdf", ".exr", ".hdr", ".pic", ".tbr")
-        raise ValueError(unknown_name("kind of file", suffix, known))
+    # imports sessions, which most commands do not need
+    from traitbrdf.facts import facts
+
+    lines, picture = facts(given.file)
+    print(f"{given.file}: " + "\n".join(lines))
+    if given.picture is not None:
+        if picture is None:
+            raise ValueError(f"--picture: expected a material or a map, got {given.file!r}")
+        given.picture.parent.mkdir(parents=True, exist_ok=True)
+        write_png(given.picture, picture)
     return 0
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,23 +15,42 @@ from numpy.typing import NDArray
 from traitbrdf.design.document import Document, Varying
 from traitbrdf.design.surface import SurfaceWeights
 from traitbrdf.export.baking import Baked, Fitter, columns, painted_tables
+from traitbrdf.export.fitting import Target
 from traitbrdf.export.gltf import GltfPart, GltfTarget, write_glb
-from traitbrdf.export.lobes import fitting_pixels
+from traitbrdf.export.lobes import PicturePixels, Pixels, fitting_pixels
 from traitbrdf.export.mitsuba import MitsubaPart, write_mitsuba
 from traitbrdf.export.openpbr import OpenPBRTarget, write_mtlx
 from traitbrdf.export.pieces import Piece, Texels, pieces_of, unwrapped, write_obj
+from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.formats.images import write_exr
 from traitbrdf.reflectance.brdf import TabulatedBRDF
+from traitbrdf.scene.lights import EnvironmentMap
 from traitbrdf.scene.scene import Scene
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.material import Material
 from traitbrdf.transport.visibility import Progress
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Look = TypeVar("Look")
 
 SUFFIXES = (".glb", ".mtlx", ".py")
 """Endings of the names of files that designs are exported to."""
+
+
+class Pair(NamedTuple):
+    """A material as a table and as a file says it, to compare.
+
+    Attributes
+    ----------
+    part : str
+    material : TabulatedBRDF
+    image : what gives the radiance (m, 3) of pixels by the file's own model
+    """
+
+    part: str
+    material: TabulatedBRDF
+    image: Callable[[Pixels], Float64]
 
 
 @dataclass(frozen=True)
@@ -44,15 +64,48 @@ class Exported:
     errors : dict of part to float
         Mean relative L1 of a sphere of the exported material against that of the table, under
         lights that the fit did not see; 0 where tables are exported as they are.
+    pairs : tuple of Pair
+        The materials of the parts, where nothing is painted locally; none for tables.
     """
 
     files: tuple[Path, ...]
     errors: dict[str, float]
+    pairs: tuple[Pair, ...] = field(default=(), repr=False)
 
     def __str__(self) -> str:
         said = ", ".join(f"{part} {100.0 * error:.1f} %" for part, error in self.errors.items())
         others = "".join(f", {file.name}" for file in self.files[1:])
         return f"{self.files[0].name}{others}; error of a lit sphere: {said}"
+
+    def picture(self, environment: EnvironmentMap, size: int = 128) -> NDArray[np.uint8]:
+        """Draw spheres (2 size, n size, 3): the table of each part, and what the file says below.
+
+        Parameters
+        ----------
+        environment : EnvironmentMap
+        size : int
+            Pixels of a sphere.
+
+        Raises
+        ------
+        ValueError
+            If tables were exported, which need no comparison.
+        """
+        if not self.pairs:
+            raise ValueError("picture: expected a file with fitted materials, got one with tables")
+        pixels = PicturePixels(self.pairs[0].material.grid, environment, size)
+        columns = []
+        for pair in self.pairs:
+            values = pair.material.values.reshape(-1, 3)
+            mirror = np.asarray(pair.material.mirror, np.float64)
+            both = [
+                pixels.picture(lambda p, v=values, m=mirror: p.of_table(v, m)),  # type: ignore[misc]
+                pixels.picture(pair.image),
+            ]
+            lit = both[0].any(axis=-1)
+            exposure = exposure_of(both[0][lit][None])
+            columns.append(np.concatenate([tone_map(one, exposure) for one in both]))
+        return np.concatenate(columns, axis=1)
 
 
 def export_design(
@@ -128,6 +181,19 @@ class _Shown:
                 amounts = SurfaceWeights(scene, places).amounts(varying)
             self.parts.append((piece, varying, texels, amounts))
 
+    def table(self, material: Material) -> TabulatedBRDF:
+        """Return a material as a table."""
+        grid = self.embedding.grid_
+        values = material.values(self.embedding).reshape(*grid.shape, 3)
+        return TabulatedBRDF(grid, values, material.mirror, material.name or "")
+
+    def pairs(self, target: Target[Look], looks: Mapping[str, Look]) -> tuple[Pair, ...]:
+        """Return the parts' materials beside their fits."""
+        return tuple(
+            Pair(part, self.table(self.materials[part]), functools.partial(target.image, look))
+            for part, look in looks.items()
+        )
+
     def fitted(self, fitter: Fitter[Look]) -> list[tuple[Piece, Look, Baked[Look] | None, Any]]:
         """Return each part's piece, look and error, and what is baked for its texels."""
         found: list[tuple[Piece, Look, Baked[Look] | None, Any]] = []
@@ -143,17 +209,20 @@ class _Shown:
 
 
 def _to_glb(path: Path, shown: _Shown) -> Exported:
-    fitter = Fitter(GltfTarget(), shown.embedding, fitting_pixels(shown.embedding.grid_))
-    parts, errors = [], {}
+    target = GltfTarget()
+    fitter = Fitter(target, shown.embedding, fitting_pixels(shown.embedding.grid_))
+    parts, errors, looks = [], {}, {}
     for piece, look, baked, found in shown.fitted(fitter):
         errors[piece.name] = found if baked is None else baked.error
+        looks[piece.name] = look
         parts.append(GltfPart(piece, look, None if baked is None else found))
     write_glb(path, shown.scene, parts)
-    return Exported((path,), errors)
+    return Exported((path,), errors, shown.pairs(target, looks))
 
 
 def _to_mtlx(path: Path, shown: _Shown) -> Exported:
-    fitter = Fitter(OpenPBRTarget(), shown.embedding, fitting_pixels(shown.embedding.grid_))
+    target = OpenPBRTarget()
+    fitter = Fitter(target, shown.embedding, fitting_pixels(shown.embedding.grid_))
     looks, errors, files, pieces = {}, {}, [path], []
     maps: dict[str, dict[str, Path]] = {}
     for piece, look, baked, found in shown.fitted(fitter):
@@ -173,28 +242,20 @@ def _to_mtlx(path: Path, shown: _Shown) -> Exported:
         files.append(path.with_suffix(".obj"))
         write_obj(files[-1], pieces)
     write_mtlx(path, looks, maps)
-    return Exported(tuple(files), errors)
+    return Exported(tuple(files), errors, shown.pairs(target, looks))
 
 
 def _to_mitsuba(path: Path, shown: _Shown) -> Exported:
-    parts, grid = [], shown.embedding.grid_
-
-    def table(material: Material) -> TabulatedBRDF:
-        values = material.values(shown.embedding).reshape(*grid.shape, 3)
-        return TabulatedBRDF(grid, values, material.mirror, material.name or "")
-
+    parts = []
     for piece, varying, texels, amounts in shown.parts:
         if varying is None or texels is None:
-            parts.append(MitsubaPart(piece, [table(shown.materials[piece.name])]))
+            parts.append(MitsubaPart(piece, [shown.table(shown.materials[piece.name])]))
             continue
         materials, paint = painted_tables(varying, amounts)
-        whole = {
-            "cell": texels.spread(paint["cell"][:, None].astype(np.float64))[..., 0].ravel(),
-            "share": np.stack(
-                [texels.spread(axis[:, None])[..., 0].ravel() for axis in paint["share"]]
-            ),
-            "corners": paint["corners"],
-        }
-        parts.append(MitsubaPart(piece, [table(one) for one in materials], whole))
+        square = texels.spread(np.stack([paint["cell"], *paint["share"]], axis=1))
+        flat = square.reshape(-1, square.shape[-1]).T
+        whole = {"cell": flat[0], "share": flat[1:], "corners": paint["corners"]}
+        parts.append(MitsubaPart(piece, [shown.table(one) for one in materials], whole))
     write_mitsuba(path, shown.scene, parts)
-    return Exported((path, path.with_suffix(".npz")), {p.piece.name: 0.0 for p in parts})
+    errors = dict.fromkeys((part.piece.name for part in parts), 0.0)
+    return Exported((path, path.with_suffix(".npz")), errors)
