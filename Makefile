@@ -27,6 +27,8 @@ peers: venv
 browser: venv
 	$(BIN)/python -m pip install --quiet --editable ".[browser]" \
 		|| echo "make: no playwright or jupyterlab: the browser tests are skipped"
+	@command -v npm >/dev/null && npm install --silent --no-fund --no-audit --prefix $(VENV)/npm \
+		gltf-validator@2 three@0.180 >/dev/null || echo "make: no npm: exported glTF files are not validated"
 	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
 		&& apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
 		apt-get install -y -qq --no-install-recommends chromium >/dev/null; } \

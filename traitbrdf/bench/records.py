@@ -76,9 +76,9 @@ class Record:
 
 NAMES = (
     "transport", "families", "shadows", "table", "embedding", "edit", "prepare", "live", "peers",
-    "traits", "local", "promises", "trade",
+    "traits", "local", "export", "promises", "trade",
 )  # fmt: skip
 """Names of the benches; `traitbrdf.bench.run` maps them to functions."""
 
-ON_REQUEST = frozenset({"peers", "promises", "trade"})
+ON_REQUEST = frozenset({"peers", "export", "promises", "trade"})
 """Benches that run only when named: they take long, or need optional packages."""

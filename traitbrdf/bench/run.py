@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 from traitbrdf.bench.edits import edit_speed, preparation
 from traitbrdf.bench.embedding import embedding_error, table_error
+from traitbrdf.bench.export import exported
 from traitbrdf.bench.live import live_edits
 from traitbrdf.bench.local import local_paint
 from traitbrdf.bench.records import NAMES, ON_REQUEST, Record, Say
@@ -27,7 +28,8 @@ BENCHES: dict[str, Bench] = dict(
         NAMES,
         (
             transport_error, family_error, shadow_error, table_error, embedding_error, edit_speed,
-            preparation, live_edits, peer_speed, trait_laws, local_paint, promises_kept, trade,
+            preparation, live_edits, peer_speed, trait_laws, local_paint, exported,
+            promises_kept, trade,
         ),
         strict=True,
     )

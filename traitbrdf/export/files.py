@@ -99,7 +99,7 @@ class Exported:
             values = pair.material.values.reshape(-1, 3)
             mirror = np.asarray(pair.material.mirror, np.float64)
             both = [
-                pixels.picture(lambda p, v=values, m=mirror: p.of_table(v, m)),  # type: ignore[misc]
+                pixels.picture(functools.partial(Pixels.of_table, values=values, mirror=mirror)),
                 pixels.picture(pair.image),
             ]
             lit = both[0].any(axis=-1)

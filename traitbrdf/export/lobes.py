@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 import numpy as np
+import scipy.interpolate
 from numpy.typing import NDArray
 
 from traitbrdf.reflectance.brdf import HalfDiffGrid
@@ -42,6 +43,7 @@ _PIXELS = 60  # of each light
 _SIZE = 48
 _KEPT = 8  # images of a picture
 _STEPS = 64  # of each angle, for albedos
+_COSINES: Float64 = 1e-3 + (1.0 - 1e-3) * np.linspace(0.0, 1.0, 49) ** 2
 
 
 class Pixels(ABC):
@@ -183,12 +185,19 @@ class FittingPixels(Pixels):
     @functools.cached_property
     def _ggx(self) -> tuple[Float64, Float64]:
         images = np.stack([super(FittingPixels, self).ggx(a) for a in ALPHAS.tolist()])
-        return images, np.stack([ggx_albedo(self.cosine, a) for a in ALPHAS.tolist()])
+        albedo = np.stack([ggx_albedo(_COSINES, a) for a in ALPHAS.tolist()])
+        return images, self._at_views(albedo)
 
     @functools.cached_property
     def _sheen(self) -> tuple[Float64, Float64]:
         images = np.stack([super(FittingPixels, self).sheen(a) for a in SHEENS.tolist()])
-        return images, np.stack([sheen_albedo(self.cosine, a) for a in SHEENS.tolist()])
+        albedo = np.stack([sheen_albedo(_COSINES, a) for a in SHEENS.tolist()])
+        return images, self._at_views(albedo)
+
+    def _at_views(self, albedo: Float64) -> Float64:
+        """Interpolate albedos (n, cosines, ...) at the pixels' views."""
+        found: Float64 = scipy.interpolate.interp1d(_COSINES, albedo, axis=1)(self.cosine)
+        return found
 
     @functools.cached_property
     def _fuzz(self) -> Float64:
@@ -222,7 +231,7 @@ class PicturePixels(Pixels):
         """Return the radiance (m, T) of scalar tables (grid.size, T) in light of one colour."""
         key = hashlib.blake2b(np.ascontiguousarray(tables).tobytes()).digest()
         if key not in self._known:
-            self._known[key] = self._operator.part_images(0, tables, interpolate=False)
+            self._known[key] = self._operator.part_images(0, tables)
             if len(self._known) > _KEPT:
                 self._known.popitem(last=False)
         return self._known[key][:, self.colour].astype(np.float64)

@@ -203,8 +203,10 @@ def unwrapped(piece: Piece, size: int) -> tuple[Piece, Texels]:
     """
     if piece.uvs is not None and (piece.uvs >= 0.0).all() and (piece.uvs <= 1.0).all():
         found = _texels(piece, piece.uvs, size)
-        a, b, c = (piece.uvs[piece.faces[:, i]] for i in range(3))
-        area = 0.5 * np.abs(np.cross(np.append(b - a, 0 * a[:, :1], 1), c - a)[..., 2]).sum()
+        (bx, by), (cx, cy) = (
+            (piece.uvs[piece.faces[:, i]] - piece.uvs[piece.faces[:, 0]]).T for i in (1, 2)
+        )
+        area = 0.5 * float(np.abs(bx * cy - by * cx).sum())
         if len(found.place) >= _FULL * area * size * size > 0.0:
             return piece, found
     xatlas = _xatlas()
