@@ -131,7 +131,7 @@ def test_effects_read_like_calls():
         (lambda: tb.Tint(math.inf), ValueError, "rgb: expected"),
         (lambda: tb.Tint(0.5, "highlight"), ValueError, "of: expected"),
         (lambda: tb.Assign(3.0), TypeError, "material: expected"),
-        (lambda: tb.Assign(["a"]), TypeError, "coordinates"),
+        (lambda: tb.Assign(["a"]), TypeError, "material: expected real numbers"),
         (lambda: Layer("shiny", Parts.of("body")), TypeError, "effect"),
         (lambda: Layer(Move(shiny=0.1), "body"), TypeError, "mask"),
         (lambda: Parts.of([]), ValueError, "at least one name"),

@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "traitbrdf"
 
 FLOORS = (
-    ("compiled", "directions", "formats", "host"),
+    ("arguments", "compiled", "host"),
+    ("directions", "formats"),
     ("reflectance",),
     ("scene", "recipes"),
     ("transport", "reference"),

@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import numbers
+
 Array = NDArray[np.floating[Any]]
 
 
@@ -47,7 +49,7 @@ def as_directions(value: ArrayLike, name: str) -> Array:
         If the last axis is not 3, a component is not finite, or a length differs from 1 by more
         than 1e-3.
     """
-    w = np.asarray(value)
+    w = numbers(value, name)
     if not np.issubdtype(w.dtype, np.floating):
         w = w.astype(np.float64)
     if w.ndim == 0 or w.shape[-1] != 3:

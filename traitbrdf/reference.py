@@ -25,10 +25,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import told
 from traitbrdf.directions import half_diff_angles, reflect, to_local
 from traitbrdf.formats.display import exposure_of, tone_map
 from traitbrdf.host import steady_in_threads
-from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF, checked_reflectance
 from traitbrdf.scene.lights import EnvironmentMap, Light, PointLight, texel_moments, turn_about_y
 from traitbrdf.scene.scene import Scene
 
@@ -240,6 +241,10 @@ def render(
     ValueError
         If a visible part has no reflectance.
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene, got {told(scene)}")
+    for brdf in brdfs.values() if isinstance(brdfs, Mapping) else [brdfs]:
+        checked_reflectance(brdf, "brdfs")
     if isinstance(brdfs, Mapping):
         seen = [scene.parts[i] for i in np.unique(scene.pixel_part)]
         missing = [name for name in seen if name not in brdfs]

@@ -12,12 +12,20 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from traitbrdf.reflectance.brdf import HalfDiffGrid, Reflectance, TabulatedBRDF
+from traitbrdf.arguments import numbers
+from traitbrdf.reflectance.brdf import (
+    SUFFIXES,
+    HalfDiffGrid,
+    Reflectance,
+    TabulatedBRDF,
+    checked_reflectance,
+)
 from traitbrdf.reflectance.parameters import CLOSED_FORMS, is_closed_form
 from traitbrdf.space.embedding import BRDFEmbedding
 from traitbrdf.space.library import Library
@@ -275,16 +283,10 @@ class Assign(Effect):
     def __post_init__(self) -> None:
         given = self.material
         if isinstance(given, (list, tuple, np.ndarray)):
-            try:
-                point = np.asarray(given, np.float64)
-            except (TypeError, ValueError):
-                raise TypeError(f"material: expected coordinates (k,), got {given!r}") from None
+            point = numbers(given, "material").astype(np.float64)
             object.__setattr__(self, "material", _plain(point))
-        elif not isinstance(given, str) and not callable(getattr(given, "eval", None)):
-            raise TypeError(
-                "material: expected a library name, a BRDF with an eval method, or coordinates, "
-                f"got {given!r}"
-            )
+        elif not isinstance(given, str) or Path(given).suffix.lower() in SUFFIXES:
+            checked_reflectance(given, "material")
 
     def apply(self, material: Material, weight: float, palette: Palette) -> Applied:
         """Go a share `weight` of the way to the new material; see `Effect.apply`."""

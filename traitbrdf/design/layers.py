@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass, field
 
+from traitbrdf.arguments import number
 from traitbrdf.design.effects import Effect, Move, Named, table_name
 from traitbrdf.design.masks import Brushed, Framing, Local, Mask, Painted, Parts
 
@@ -41,15 +41,13 @@ class Layer:
             raise TypeError(f"effect: expected an effect such as tb.Move, got {self.effect!r}")
         if not isinstance(self.mask, Mask):
             raise TypeError(f"mask: expected a mask, got {self.mask!r}")
-        if isinstance(self.opacity, bool) or not isinstance(self.opacity, (int, float)):
-            raise TypeError(f"opacity: expected a number, got {self.opacity!r}")
-        if not (math.isfinite(self.opacity) and 0.0 <= self.opacity <= 1.0):
+        object.__setattr__(self, "opacity", number(self.opacity, "opacity"))
+        if not 0.0 <= self.opacity <= 1.0:
             raise ValueError(f"opacity: expected 0 to 1, got {self.opacity!r}")
         if not isinstance(self.visible, bool):
             raise TypeError(f"visible: expected True or False, got {self.visible!r}")
         if not isinstance(self.name, str):
             raise TypeError(f"name: expected a string, got {self.name!r}")
-        object.__setattr__(self, "opacity", float(self.opacity))
 
     @property
     def local(self) -> bool:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Self, TypeAlias
 
+from traitbrdf.arguments import number
 from traitbrdf.design.strokes import Stroke
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.scene.camera import Camera
@@ -73,7 +74,9 @@ class Parts:
     def of(cls, target: Target) -> Self:
         """Return the mask of a part, of several, or of weighted ones."""
         if isinstance(target, Mapping):
-            return cls(tuple((name, float(weight)) for name, weight in target.items()))
+            return cls(tuple((name, number(weight, name)) for name, weight in target.items()))
+        if not isinstance(target, Iterable):
+            raise TypeError(f"part: expected names of parts, got {target!r}")
         names = [target] if isinstance(target, str) else dict.fromkeys(target)
         return cls(tuple((name, 1.0) for name in names))
 

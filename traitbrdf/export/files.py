@@ -22,6 +22,7 @@ from traitbrdf.export.mitsuba import MitsubaPart, write_mitsuba
 from traitbrdf.export.openpbr import OpenPBRTarget, write_mtlx
 from traitbrdf.export.pieces import Piece, Texels, pieces_of, unwrapped, write_obj
 from traitbrdf.formats.display import exposure_of, tone_map
+from traitbrdf.formats.files import as_path
 from traitbrdf.formats.images import write_exr
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.scene.lights import EnvironmentMap
@@ -142,7 +143,7 @@ def export_design(
     RuntimeError
         If a package of the extra ``export`` is needed and not installed.
     """
-    target = Path(path)
+    target = as_path(path)
     kinds = {".glb": _to_glb, ".mtlx": _to_mtlx, ".py": _to_mitsuba}
     if target.suffix not in kinds:
         raise ValueError(f"path: expected a name in {', '.join(SUFFIXES)}, got {str(path)!r}")

@@ -129,7 +129,7 @@ class GltfTarget:
         reflected = look.specular * (f0 * constant + (1.0 - f0) * grazing)
         most = look.specular * float(f0.max())
         rest = look.specular - most  # what is added towards grazing angles
-        body = (1.0 - most) * pixels.diffuse[:, :1] - rest * pixels.diffuse[:, 1:2]
+        body = (1.0 - most) * pixels.diffuse()[:, :1] - rest * pixels.diffuse()[:, 1:2]
         dielectric = base * body + reflected
         image = look.metallic * metal + (1.0 - look.metallic) * dielectric
         sheen = np.array(look.sheen_color)

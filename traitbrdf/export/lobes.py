@@ -101,9 +101,8 @@ class Pixels(ABC):
         """Return the directional albedo (m,) of the lobe of `sheen` at the pixels' views."""
         return sheen_albedo(self.cosine, alpha)
 
-    @functools.cached_property
     def diffuse(self) -> Float64:
-        """The images (m, 3) of 1/pi times the three terms of `ggx`."""
+        """Return the images (m, 3) of 1/pi times the three terms of `ggx`."""
         return self._of_lobe(np.full(self.grid.shape, 1.0 / math.pi))
 
     def _of_lobe(self, lobe: Float64) -> Float64:
@@ -169,6 +168,14 @@ class FittingPixels(Pixels):
     def sheen(self, alpha: float) -> Float64:
         """Interpolate the image (m,) of a sheen lobe."""
         return _between(SHEENS, self._sheen[0], alpha)
+
+    def diffuse(self) -> Float64:
+        """Return the images (m, 3) of 1/pi times the three terms of `ggx`; they are kept."""
+        return self._diffuse
+
+    @functools.cached_property
+    def _diffuse(self) -> Float64:
+        return super().diffuse()
 
     def fuzz(self, roughness: float) -> Float64:
         """Interpolate the image (m,) of a lobe of fuzz."""

@@ -120,7 +120,7 @@ class OpenPBRTarget:
         missing = (1.0 - albedo[:, 0]) / albedo[:, 0]
         reflected, through = _dielectric(lobe, albedo, missing, ior)
         base, tint = np.array(look.base_color), np.array(look.specular_color)
-        dielectric = base * (through * pixels.diffuse[:, 0])[:, None] + tint * reflected[:, None]
+        dielectric = base * (through * pixels.diffuse()[:, 0])[:, None] + tint * reflected[:, None]
         # Hoffman's form of Schlick's term, with the tint at 82 degrees
         edge = 1.0 / 7.0
         bend = (base + (1.0 - base) * (1.0 - edge) ** 5) * (1.0 - tint) / (edge * (1.0 - edge) ** 6)

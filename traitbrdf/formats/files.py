@@ -77,7 +77,7 @@ def atomic_path(path: PathName) -> Iterator[Path]:
     PermissionError
         If it may not be written.
     """
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(as_path(path)))
     if target.is_dir():
         raise IsADirectoryError(f"{path}: expected the path of a file to write, got a folder")
     if not target.parent.is_dir():
@@ -115,9 +115,18 @@ def atomic_path(path: PathName) -> Iterator[Path]:
 def open_binary(path: PathName) -> BinaryIO:
     """Open the file at `path` for reading bytes; the FileNotFoundError is one short line."""
     try:
-        return Path(path).open("rb")
+        return as_path(path).open("rb")
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise IsADirectoryError(f"{path}: expected a file, got a folder") from None
+
+
+def as_path(path: object) -> Path:
+    """Return a path; the TypeError says what came instead of one."""
+    if not isinstance(path, (str, PathLike)):
+        raise TypeError(f"path: expected the path of a file, got {path!r}")
+    return Path(path)
 
 
 def file_size(file: BinaryIO) -> int:

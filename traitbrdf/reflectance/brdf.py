@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import numbers, told, whole
 from traitbrdf.directions import (
     Array,
     as_directions,
@@ -27,7 +28,7 @@ from traitbrdf.directions import (
     half_diff_angles,
 )
 from traitbrdf.formats.brdfs import MERL_SCALE, read_merl, write_merl, write_rgl
-from traitbrdf.formats.files import FormatError, read_arrays, stem, write_arrays
+from traitbrdf.formats.files import FormatError, as_path, read_arrays, stem, write_arrays
 from traitbrdf.host import steady
 from traitbrdf.reflectance.measured import rgl_fields
 
@@ -58,6 +59,42 @@ class Reflectance(Protocol):
         wi, wo : (..., 3) array_like
             Directions to the light and to the viewer.
         """
+
+
+def checked_reflectance(given: object, name: str) -> Reflectance:
+    """Return a table, a model or a measurement; say what else was given, and what to do.
+
+    Parameters
+    ----------
+    given : object
+    name : str, of the argument
+
+    Raises
+    ------
+    TypeError
+    """
+    if isinstance(given, type):
+        raise TypeError(
+            f"{name}: expected a BRDF such as {given.__name__}(), got the class {given.__name__}"
+        )
+    if isinstance(given, (str, PathLike)):
+        raise TypeError(
+            f"{name}: expected a table or a model, got {str(given)!r}: {how_to_read(given)}"
+        )
+    if not callable(getattr(given, "eval", None)):
+        raise TypeError(
+            f"{name}: expected a table or a model with an eval method, got {told(given)}"
+        )
+    return given  # type: ignore[return-value]
+
+
+def how_to_read(given: str | PathLike[str]) -> str:
+    """Return what to do with the name of a file, or of a library material, that is no BRDF yet."""
+    if Path(given).suffix.lower() == ".bsdf":
+        return "read a file by tb.MeasuredBRDF.read"
+    if Path(given).suffix:
+        return "read a file by tb.TabulatedBRDF.read"
+    return "take a library material by tb.default_library()[name]"
 
 
 @dataclass(frozen=True)
@@ -98,9 +135,7 @@ class HalfDiffGrid:
 
     def __post_init__(self) -> None:
         for name in ("n_theta_h", "n_theta_d", "n_phi_d"):
-            count = getattr(self, name)
-            if not isinstance(count, int) or count < 2:
-                raise ValueError(f"{name}: expected an integer of at least 2, got {count!r}")
+            object.__setattr__(self, name, whole(getattr(self, name), name, 2))
         if self.layout not in ("merl", "folded"):
             raise ValueError(f"layout: expected 'merl' or 'folded', got {self.layout!r}")
 
@@ -296,7 +331,9 @@ class TabulatedBRDF:
         mirror: ArrayLike = (0.0, 0.0, 0.0),
         name: str = "",
     ) -> None:
-        table = np.asarray(values)
+        if not isinstance(grid, HalfDiffGrid):
+            raise TypeError(f"grid: expected a HalfDiffGrid, got {told(grid)}")
+        table = numbers(values, "values")
         if table.dtype not in (np.float32, np.float64):
             table = table.astype(np.float64)
         if table.shape != (*grid.shape, 3):
@@ -334,6 +371,9 @@ class TabulatedBRDF:
         dtype : float32 or float64
             Type of the table.
         """
+        checked_reflectance(model, "model")
+        if not isinstance(grid, HalfDiffGrid):
+            raise TypeError(f"grid: expected a HalfDiffGrid, got {told(grid)}")
         wi, wo = _kept_directions(grid) if grid.size < _KEPT else grid.node_directions()
         return cls(grid, model.eval(wi, wo).astype(dtype), model.mirror, name)
 
@@ -354,7 +394,7 @@ class TabulatedBRDF:
             As `traitbrdf.formats.brdfs.read_merl`, or on fewer than 2 nodes along an axis, or an
             ``.npz`` that `write` has not made.
         """
-        if Path(path).suffix.lower() == ".npz":
+        if as_path(path).suffix.lower() == ".npz":
             return cls._read_arrays(path)
         values = read_merl(path)
         n_h, n_d, n_p, _ = values.shape
@@ -397,7 +437,7 @@ class TabulatedBRDF:
         ValueError
             On another suffix.
         """
-        suffix = Path(path).suffix.lower()
+        suffix = as_path(path).suffix.lower()
         if suffix == ".binary":
             grid = HalfDiffGrid.merl()
             values = self.values.astype(np.float64) if self.grid == grid else self._fitted(grid)
@@ -472,7 +512,7 @@ class TabulatedBRDF:
         theta_o : (...) array_like
             View angles in radians, in [0, pi/2).
         """
-        theta = np.asarray(theta_o, np.float64)
+        theta = numbers(theta_o, "theta_o").astype(np.float64)
         rows = albedo_operator(self.grid, theta.ravel())
         result = rows @ self.values.reshape(-1, 3).astype(np.float64) + self._mirror
         return np.asarray(result).reshape(*theta.shape, 3)

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import number, numbers, whole
 from traitbrdf.directions import Array, direction_to_latlong, latlong_to_direction
 from traitbrdf.formats.files import FormatError
 from traitbrdf.formats.images import Picture, read_picture
@@ -116,7 +117,7 @@ Light = PointLight | DirectionalLight
 def _triple(
     value: Sequence[float], name: str, low: float = -math.inf
 ) -> tuple[float, float, float]:
-    a = np.asarray(value, np.float64)
+    a = numbers(value, name).astype(np.float64)
     if a.shape != (3,) or not np.isfinite(a).all() or a.min() < low:
         bound = "" if low == -math.inf else f" of at least {low:g}"
         raise ValueError(f"{name}: expected three finite numbers{bound}, got {value!r}")
@@ -160,8 +161,7 @@ class EnvironmentMap:
             image = np.ascontiguousarray(image, dtype=np.float32)
         if fault := _fault(image):
             raise ValueError("radiance: expected {}, got {}".format(*fault))
-        if not math.isfinite(rotation):
-            raise ValueError(f"rotation: expected a finite angle in radians, got {rotation!r}")
+        rotation = number(rotation, "rotation")
         if image.flags.writeable and np.may_share_memory(image, radiance):
             image = image.copy()  # so that the caller's array is not made read-only below
         self.image = image
@@ -234,7 +234,9 @@ class EnvironmentMap:
         rows : int
             Height of the map; it is twice as wide.
         """
-        return cls(np.broadcast_to(np.asarray(radiance, np.float64), (rows, 2 * rows, 3)))
+        rows = whole(rows, "rows", 1)
+        level = numbers(radiance, "radiance").astype(np.float64)
+        return cls(np.broadcast_to(level, (rows, 2 * rows, 3)))
 
     @classmethod
     def sky(
@@ -260,8 +262,7 @@ class EnvironmentMap:
         ValueError
             If `rows` is not a positive integer.
         """
-        if not isinstance(rows, int) or rows < 1:
-            raise ValueError(f"rows: expected a positive integer, got {rows!r}")
+        rows = whole(rows, "rows", 1)
         v, u = np.meshgrid(
             (np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows),
             indexing="ij",
@@ -285,7 +286,7 @@ class EnvironmentMap:
                 inside = (np.abs(away) < half_width) & (elevation > low) & (elevation < high)
                 image = np.where(inside[..., None], np.array(colour), image)
         if sun is not None:
-            a, e = np.radians(np.asarray(sun, np.float64))
+            a, e = np.radians([number(angle, "sun") for angle in sun])
             toward = np.array([math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a)])
             inside = w @ toward > math.cos(math.radians(3.0))
             image = np.where(inside[..., None], np.array([300.0, 270.0, 225.0]), image)
@@ -293,11 +294,12 @@ class EnvironmentMap:
 
     def rotated(self, angle: float) -> EnvironmentMap:
         """Return the map turned further about +y by `angle` radians."""
-        return self._like(self.image, self.rotation + angle)
+        return self._like(self.image, self.rotation + number(angle, "angle"))
 
     def scaled(self, factor: ArrayLike) -> EnvironmentMap:
         """Return the map times `factor`, a number or RGB (3,), not negative."""
-        return self._like(self.image * np.asarray(factor, np.float32), self.rotation)
+        level = numbers(factor, "factor").astype(np.float32)
+        return self._like(self.image * level, self.rotation)
 
     def _like(self, image: NDArray[np.float32], rotation: float) -> EnvironmentMap:
         result = EnvironmentMap(image, rotation)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from os import PathLike
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from traitbrdf.formats.files import FormatError
+from traitbrdf.formats.files import FormatError, as_path
 from traitbrdf.formats.gltf import read_gltf
 from traitbrdf.formats.polygons import FLAT, read_obj, read_ply
 from traitbrdf.host import steady
@@ -53,7 +52,7 @@ def load_mesh(path: str | PathLike[str]) -> Mesh:
         If the format is another, the file cannot be read, needs what is not supported, has no
         triangles with an area, or has vertices that are not finite.
     """
-    file = Path(path)
+    file = as_path(path)
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such mesh file")
     suffix = file.suffix.lower()

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.arguments import told
 from traitbrdf.host import steady
 from traitbrdf.scene.camera import MAX_SUBSAMPLES, Camera, dots, image_size
 from traitbrdf.scene.lights import DirectionalLight, EnvironmentMap, Light, PointLight
@@ -137,7 +138,9 @@ class Scene:
         subsamples: int = 8,
     ) -> None:
         if not callable(getattr(shape, "intersect", None)):
-            raise TypeError(f"shape: expected a shape such as teapot(), got {shape!r}")
+            given: object = shape
+            hint = ": tb.load_mesh reads a file" if isinstance(given, str) else ""
+            raise TypeError(f"shape: expected a shape such as teapot(), got {told(shape)}{hint}")
         if camera is not None and not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a Camera, got {camera!r}")
         if (
@@ -174,7 +177,13 @@ class Scene:
     ) -> None:
         """Set the settings that the primary rays do not depend on."""
         if environment is not None and not isinstance(environment, EnvironmentMap):
-            raise TypeError(f"environment: expected an EnvironmentMap, got {environment!r}")
+            raise TypeError(
+                f"environment: expected an EnvironmentMap, got {told(environment)}; "
+                "tb.EnvironmentMap.read reads a file"
+            )
+        many: object = lights
+        if not isinstance(many, Sequence):
+            raise TypeError(f"lights: expected a sequence of lights, got {told(many)}")
         for light in lights:
             if not isinstance(light, (PointLight, DirectionalLight)):
                 raise TypeError(f"lights: expected point or directional lights, got {light!r}")

@@ -20,6 +20,7 @@ import embreex.rtcore_scene
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import number, numbers
 from traitbrdf.directions import as_directions, shading_frame
 
 Float = NDArray[np.float64]
@@ -276,10 +277,10 @@ def sphere(radius: float = 1.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Sphere:
     ValueError
         If the radius is not above zero, or a number is not finite.
     """
-    c = np.array(center, dtype=np.float64)
+    c = numbers(center, "center").astype(np.float64)
     if c.shape != (3,) or not np.isfinite(c).all():
         raise ValueError(f"center: expected three finite numbers, got {center!r}")
-    if not (math.isfinite(radius) and radius > 0.0):
+    if number(radius, "radius") <= 0.0:
         raise ValueError(f"radius: expected a finite number above 0, got {radius!r}")
     c.flags.writeable = False
     return Sphere(float(radius), c)

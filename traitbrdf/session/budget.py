@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from traitbrdf.arguments import number
 from traitbrdf.transport.transport import Transport
 
 Float64 = NDArray[np.float64]
@@ -111,6 +112,7 @@ def quality_for(error: float | None) -> str:
     """
     if error is None:
         return "interactive"
+    error = number(error, "error")
     return "preview" if error >= 0.04 else "interactive" if error >= 0.008 else "accurate"
 
 

@@ -16,6 +16,7 @@ from typing import Any, NoReturn, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.arguments import number, whole
 from traitbrdf.design.colours import Colour
 from traitbrdf.design.document import Design, Document, Varying
 from traitbrdf.design.effects import Assign, Assignable, Effect, Move, Palette, names_of
@@ -173,8 +174,8 @@ class EditSession(Viewer):
         part : str
             Its name.
         at : (x, y) or None
-            In pixels of the image, where the part is seen: the material there, all that is painted
-            locally included. None is the material where nothing is.
+            In pixels, where the part is seen: the material there, local paint included. None is
+            the material where nothing is painted locally.
 
         Raises
         ------
@@ -183,6 +184,8 @@ class EditSession(Viewer):
         """
         material = self.material(part)
         if at is not None:
+            if len(at) != 2:
+                raise ValueError(f"at: expected (x, y) in pixels, got {at!r}")
             seen = self.pick(*at)
             if seen is None or seen.part != part:
                 other = "nothing" if seen is None else repr(seen.part)
@@ -206,7 +209,7 @@ class EditSession(Viewer):
         body: red-rubber; layers: 0 'base', 2 (40 %)
         """
         with self._lock:
-            return pick(self.scene, (float(x), float(y)), self._document, self.traits)
+            return pick(self.scene, (number(x, "x"), number(y, "y")), self._document, self.traits)
 
     def plausibility(self, part: str) -> dict[str, float]:
         """Return ``energy_scale``, ``gamut_margin`` and ``plausibility`` as `report` has them.
@@ -624,8 +627,7 @@ class EditSession(Viewer):
             On an unknown name or a smaller count.
         """
         self.traits.index(trait)
-        if isinstance(count, bool) or not isinstance(count, int) or count < 2:
-            raise ValueError(f"count: expected at least 2, got {count!r}")
+        count = whole(count, "count", 2)
         amounts = np.linspace(low, high, count)
         moves = [Move({trait: float(amount)}) for amount in amounts]
         return self._sheet(moves, [f"{trait} {a:+.2f}" for a in amounts], part, count)
@@ -653,8 +655,7 @@ class EditSession(Viewer):
         ValueError
             On an unknown part, or a count below 1.
         """
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ValueError(f"count: expected at least 1, got {count!r}")
+        count = whole(count, "count", 1)
         rng = np.random.default_rng(seed)
         moves, labels = [], []
         for _ in range(count):
@@ -705,6 +706,8 @@ class EditSession(Viewer):
         ValueError, TypeError
             On no map, or something that is none.
         """
+        if not isinstance(environments, Mapping):
+            raise TypeError(f"environments: expected maps by name, got {environments!r}")
         if not environments:
             raise ValueError("environments: expected at least one map, got none")
         images = []
@@ -854,11 +857,6 @@ class EditSession(Viewer):
         texture_size : int
             Texels on a side of the textures of parts that are painted locally.
         progress : called with (stage, fraction done); may raise to cancel
-
-        Returns
-        -------
-        Exported
-            The files, and how far each exported material is off.
         """
         with self._lock:
             scene, document = self.scene, self._document.copy()

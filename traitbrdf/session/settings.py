@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TypedDict
 
 import torch
 
+from traitbrdf.arguments import number
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.session.budget import QUALITIES
 
@@ -63,7 +63,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, asked in (("error", self.error), ("fps", self.fps)):
-            if asked is not None and not (math.isfinite(asked) and asked > 0.0):
+            if asked is not None and number(asked, name) <= 0.0:
                 raise ValueError(f"{name}: expected a positive number, got {asked!r}")
         if self.error is not None and self.fps is not None:
             raise ValueError(

@@ -25,6 +25,7 @@ import numpy as np
 import scipy  # its parts are loaded when they are first named
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import numbers
 from traitbrdf.directions import fold_phi_d
 from traitbrdf.host import steady
 from traitbrdf.reflectance.brdf import (
@@ -33,6 +34,7 @@ from traitbrdf.reflectance.brdf import (
     Reflectance,
     TabulatedBRDF,
     albedo_operator,
+    checked_reflectance,
 )
 from traitbrdf.space.fitting import batches, checked_grid, fit_weight, principal_axes
 from traitbrdf.space.highlights import Profiles
@@ -291,7 +293,7 @@ class BRDFEmbedding:
             If `z` is not k finite numbers.
         """
         self._fitted()
-        value = np.asarray(z, np.float64)
+        value = numbers(z, "z").astype(np.float64)
         if value.shape != (self.size,):
             raise ValueError(f"z: expected shape ({self.size},), got {value.shape}")
         if not np.isfinite(value).all():
@@ -304,24 +306,17 @@ class BRDFEmbedding:
         Parameters
         ----------
         brdf : Reflectance
-            A table on any grid, or a model.
+            A table on any grid, or a model; a TypeError says what else came.
 
         Returns
         -------
         (k,) float64
-
-        Raises
-        ------
-        TypeError
-            On something that has no ``eval``.
         """
         self._fitted()
-        if not callable(getattr(brdf, "eval", None)):
-            raise TypeError(f"brdf: expected a table or a model with an eval method, got {brdf!r}")
-        if isinstance(brdf, TabulatedBRDF):
-            table = brdf.regrid(self.grid_)
-        else:
+        table = checked_reflectance(brdf, "brdf")
+        if not isinstance(table, TabulatedBRDF):
             table = TabulatedBRDF.from_model(brdf, self.grid_)
+        table = table.regrid(self.grid_)
         logs = np.ascontiguousarray(channel_logs(table))
         weight = np.repeat(self.weight_[None].astype(np.float64) ** 2, 3, axis=0)
         weight *= 3.0 * 1000.0 / _NOISE**2 / weight.sum()
@@ -442,11 +437,12 @@ class BRDFEmbedding:
             On wrong shapes, or if no valid sample is left.
         """
         self._fitted()
-        values = np.asarray(rgb, np.float64)
-        angles = [np.asarray(a, np.float64) for a in (theta_h, theta_d, phi_d)]
+        values = numbers(rgb, "rgb").astype(np.float64)
+        given = {"theta_h": theta_h, "theta_d": theta_d, "phi_d": phi_d}
+        angles = [numbers(a, name).astype(np.float64) for name, a in given.items()]
         if values.ndim != 2 or values.shape[1] != 3:
             raise ValueError(f"rgb: expected shape (n, 3), got {values.shape}")
-        for name, a in zip(("theta_h", "theta_d", "phi_d"), angles, strict=True):
+        for name, a in zip(given, angles, strict=True):
             if a.shape != (len(values),):
                 raise ValueError(f"{name}: expected shape ({len(values)},), got {a.shape}")
         valid = np.all(np.isfinite(values) & (values >= 0.0), axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from traitbrdf.formats.files import artifact, unknown_name
 from traitbrdf.host import steady
-from traitbrdf.reflectance.brdf import TabulatedBRDF
+from traitbrdf.reflectance.brdf import SUFFIXES, TabulatedBRDF, how_to_read
 from traitbrdf.space.embedding import BRDFEmbedding
 
 
@@ -111,6 +112,8 @@ class Library:
             If there is no such material; the message names the nearest ones.
         """
         if name not in self._index:
+            if isinstance(name, str) and Path(name).suffix.lower() in SUFFIXES:
+                raise ValueError(f"material: {name!r} is no library material: {how_to_read(name)}")
             raise ValueError(unknown_name("material", name, self.names))
         return self._index[name]
 

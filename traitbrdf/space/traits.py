@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from traitbrdf.arguments import number, numbers
 from traitbrdf.formats.files import artifact, unknown_name
 from traitbrdf.host import steady
 from traitbrdf.reflectance.descriptors import descriptors
@@ -618,6 +619,8 @@ class TraitSpace:
     ) -> tuple[dict[int, float], list[int], tuple[str, ...]]:
         """Return moved traits and their amounts, held traits, and all that is held."""
         moved: dict[int, float] = {}
+        if not isinstance(amounts, Mapping):
+            raise TypeError(f"amounts: expected numbers by trait, got {amounts!r}")
         for name, value in amounts.items():
             if (i := self.index(name)) in moved:
                 raise ValueError(f"amounts: expected each trait once, got {self.names[i]!r} twice")
@@ -771,7 +774,7 @@ class TraitSpace:
         return (self.names[self.index(hold)],)
 
     def _point(self, z: ArrayLike) -> Float64:
-        value = np.asarray(z, np.float64)
+        value = numbers(z, "z").astype(np.float64)
         if value.shape != self.low.shape or not np.isfinite(value).all():
             raise ValueError(
                 f"z: expected {len(self.low)} finite coordinates, got shape {value.shape}"
@@ -878,17 +881,13 @@ class TraitSpace:
 
 
 def _names(hold: Iterable[str]) -> tuple[str, ...]:
+    if not isinstance(hold, Iterable):
+        raise TypeError(f"hold: expected names of traits, got {hold!r}")
     return (hold,) if isinstance(hold, str) else tuple(hold)
 
 
 def _amount(name: str, value: float) -> float:
-    try:
-        amount = float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"amount of {name!r}: expected a number, got {value!r}") from None
-    if not math.isfinite(amount):
-        raise ValueError(f"amount of {name!r}: expected a finite number, got {value!r}")
-    return amount
+    return number(value, f"amount of {name!r}")
 
 
 @functools.lru_cache(maxsize=1)
