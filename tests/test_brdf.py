@@ -74,7 +74,7 @@ def test_folded_nodes_reach_both_ends():
 def test_grids_refuse_bad_counts(bad, at):
     counts = [4, 4, 4]
     counts[at] = bad
-    with pytest.raises(ValueError, match="expected an integer of at least 2, got"):
+    with pytest.raises(ValueError, match="expected a whole number of at least 2, got"):
         HalfDiffGrid(*counts)
 
 

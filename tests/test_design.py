@@ -137,7 +137,7 @@ def test_effects_read_like_calls():
         (lambda: Parts.of([]), ValueError, "at least one name"),
         (lambda: Parts.of([3]), TypeError, "part: expected a name"),
         (lambda: Parts.of({"body": 1.5}), ValueError, "0 to 1"),
-        (lambda: Parts.of({"body": math.nan}), ValueError, "0 to 1"),
+        (lambda: Parts.of({"body": math.nan}), ValueError, "weight of 'body': expected a finite"),
         (lambda: Parts((("a", 1.0), ("a", 0.5))), ValueError, "each part once"),
     ],
 )

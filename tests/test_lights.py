@@ -227,7 +227,7 @@ def test_maps_refuse_what_is_no_light(radiance, message):
 def test_maps_refuse_other_types_and_angles():
     with pytest.raises(TypeError, match="expected real numbers"):
         EnvironmentMap(np.ones((2, 2, 3), complex))
-    with pytest.raises(ValueError, match="rotation: expected a finite angle"):
+    with pytest.raises(ValueError, match="rotation: expected a finite number"):
         EnvironmentMap(np.ones((2, 2, 3)), math.nan)
 
 
@@ -260,7 +260,7 @@ def test_sun_azimuths_are_those_of_the_camera():
 
 @pytest.mark.parametrize("rows", [0, -1, 1.5])
 def test_sky_refuses_bad_sizes(rows):
-    with pytest.raises(ValueError, match="rows: expected a positive integer"):
+    with pytest.raises(ValueError, match="rows: expected a whole number of at least 1"):
         EnvironmentMap.sky(rows=rows)
 
 

@@ -379,7 +379,7 @@ def test_a_wedge_shows_a_trait_in_steps(edit):
     np.testing.assert_allclose(edit.render(exact=False), sheet.images[4], rtol=1e-5, atol=1e-6)
     assert edit.undo()
     same(edit.render(), before)
-    with pytest.raises(ValueError, match="count: expected at least 2"):
+    with pytest.raises(ValueError, match="count: expected a whole number of at least 2"):
         edit.wedge("shiny", 1)
     with pytest.raises(ValueError, match="index: expected 0 to 4"):
         sheet.take(5)

@@ -74,7 +74,11 @@ class Parts:
     def of(cls, target: Target) -> Self:
         """Return the mask of a part, of several, or of weighted ones."""
         if isinstance(target, Mapping):
-            return cls(tuple((name, number(weight, name)) for name, weight in target.items()))
+            return cls(
+                tuple(
+                    (name, number(weight, f"weight of {name!r}")) for name, weight in target.items()
+                )
+            )
         if not isinstance(target, Iterable):
             raise TypeError(f"part: expected names of parts, got {target!r}")
         names = [target] if isinstance(target, str) else dict.fromkeys(target)
