@@ -27,9 +27,11 @@ import pytest
 
 from traitbrdf import reference
 from traitbrdf.bench import peers
-from traitbrdf.bench.peers import fit_lobe, integrator, their_map, their_rays, their_scene, traced
+from traitbrdf.bench.peers import integrator, their_rays, their_scene, traced
 from traitbrdf.bench.rivals import PEER_MATERIALS
 from traitbrdf.bench.run import run
+from traitbrdf.export.mitsuba import fit_lobe
+from traitbrdf.export.mitsuba_scene import light_map
 from traitbrdf.reflectance.brdf import HalfDiffGrid, TabulatedBRDF
 from traitbrdf.reflectance.models import GGX, Lambert
 from traitbrdf.scene.camera import Camera
@@ -155,7 +157,7 @@ def test_maps_are_turned_alike(peer):
     environment = bright_map()
     w = np.random.default_rng(1).normal(size=(5_000, 3))
     w /= np.linalg.norm(w, axis=-1, keepdims=True)
-    emitter = mi.load_dict(their_map(mi, environment, FINER))
+    emitter = mi.load_dict(light_map(mi, environment.image, environment.rotation, FINER))
     seen = dr.zeros(mi.SurfaceInteraction3f, len(w))
     seen.wi = mi.Vector3f(-w.T.astype(np.float32))
     theirs, ours = np.array(emitter.eval(seen)).T, environment.radiance(w)

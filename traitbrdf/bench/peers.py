@@ -7,7 +7,8 @@ frames, the table look-up is written a second time, and the rest is Monte Carlo.
 Mitsuba is optional (the extra ``peers``); `load` imports it.
 
 Mitsuba runs at its best settings: stratified samples (its ``multijitter``), map samples compensated
-for material samples (``mis_compensation``), a lobe fitted to each table (`fit_lobe`), and the table
+for material samples (``mis_compensation``), a lobe fitted to each table
+(`traitbrdf.export.mitsuba.fit_lobe`), and the table
 in a buffer that an edit overwrites, so that no kernel is compiled again.
 """
 
@@ -23,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.export import mitsuba_scene
-from traitbrdf.export.mitsuba import fit_lobe as fit_lobe
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.scene.lights import PointLight
 from traitbrdf.scene.scene import Scene

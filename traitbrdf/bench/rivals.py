@@ -21,6 +21,7 @@ from traitbrdf.bench.oracle import Oracle, draw_fragments, reference_values
 from traitbrdf.bench.records import Record, Say
 from traitbrdf.bench.transport import BENCH_CAMERA, how_much
 from traitbrdf.directions import shading_frame, to_local
+from traitbrdf.export.mitsuba import fit_lobe
 from traitbrdf.reflectance.brdf import (
     TabulatedBRDF,
 )
@@ -247,7 +248,7 @@ def peer_speed(data: Path | None, quick: bool, say: Say) -> Iterator[Record]:
     say(f"  {where}")
 
     start = time.perf_counter()
-    material = peer.material(tables[0], *peers.fit_lobe(tables[0]))
+    material = peer.material(tables[0], *fit_lobe(tables[0]))
     theirs = peers.their_scene(peer.mi, scene, material)
     covered = np.unique(scene.pixels)
     peers.traced(peer, theirs, scene, covered, 1, 0)
@@ -372,7 +373,7 @@ class _Rival:
     ) -> None:
         self.peer, self.theirs, self.material = peer, theirs, material
         self.scene, self.pixels, self.true = scene, pixels, true
-        self.table, self.lobe = table, peers.fit_lobe(table)
+        self.table, self.lobe = table, fit_lobe(table)
         self.covered = np.unique(scene.pixels)
         self._seeds = itertools.count(1)
 
