@@ -8,8 +8,8 @@ Mitsuba is optional (the extra ``peers``); `load` imports it.
 
 Mitsuba runs at its best settings: stratified samples (its ``multijitter``), map samples compensated
 for material samples (``mis_compensation``), a lobe fitted to each table
-(`traitbrdf.export.mitsuba.fit_lobe`), and the table
-in a buffer that an edit overwrites, so that no kernel is compiled again.
+(`traitbrdf.export.mitsuba.fit_lobe`), and the table in a buffer that an edit overwrites, so that no
+kernel is compiled again.
 """
 
 from __future__ import annotations
