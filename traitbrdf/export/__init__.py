@@ -1,1 +1,1 @@
-"""A design shown live: preparation, cache, frames."""
+"""Designs for other programs: fits, textures, files."""

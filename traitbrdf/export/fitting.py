@@ -68,7 +68,8 @@ def fit(
 ) -> Fit[Look]:
     """Fit a target's model to the pixels that a table shows.
 
-    The difference is that of tone-mapped pictures, so that dark pixels count as eyes count them.
+    The difference is that of cube roots of the exposed radiance, so that dark pixels count as eyes
+    count them.
 
     Parameters
     ----------

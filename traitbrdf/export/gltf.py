@@ -92,7 +92,7 @@ class GltfTarget:
             clearcoat=v[9],
             clearcoat_roughness=_roughness(v[10]),
             sheen_color=(v[11] ** 2, v[12] ** 2, v[13] ** 2),
-            sheen_roughness=SHEENS[0] ** 0.5 + (1.0 - SHEENS[0] ** 0.5) * v[14],
+            sheen_roughness=math.sqrt(SHEENS[0]) + (1.0 - math.sqrt(SHEENS[0])) * v[14],
         )
 
     def starts(self, colour: Float64, roughness: float) -> Iterator[Float64]:
