@@ -1,4 +1,7 @@
-"""The command line: ``traitbrdf demo | paint | render | angles | gallery | studio | info | bench``.
+"""The command line.
+
+``traitbrdf demo | paint | render | angles | gallery | studio | info | convert | export | validate |
+bench``.
 
 ``traitbrdf compile`` ends the installation.
 The exit status is 0 on success, 1 on failure with one readable line, 2 on wrong usage.
