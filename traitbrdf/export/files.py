@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from traitbrdf.arguments import whole
 from traitbrdf.design.document import Document, Varying
 from traitbrdf.design.surface import SurfaceWeights
-from traitbrdf.export.baking import Baked, Fitter, columns, painted_tables
+from traitbrdf.export.baking import Fitter, columns, painted_tables
 from traitbrdf.export.fitting import Target
 from traitbrdf.export.gltf import GltfPart, GltfTarget, write_glb
 from traitbrdf.export.lobes import PicturePixels, Pixels, fitting_pixels
@@ -34,6 +35,8 @@ from traitbrdf.transport.visibility import Progress
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Look = TypeVar("Look")
+
+_LARGEST = 8192  # texels on a side
 
 SUFFIXES = (".glb", ".mtlx", ".py")
 """Endings of the names of files that designs are exported to."""
@@ -147,15 +150,25 @@ def export_design(
     kinds = {".glb": _to_glb, ".mtlx": _to_mtlx, ".py": _to_mitsuba}
     if target.suffix not in kinds:
         raise ValueError(f"path: expected a name in {', '.join(SUFFIXES)}, got {str(path)!r}")
-    whole = isinstance(texture_size, (int, np.integer)) and not isinstance(texture_size, bool)
-    if not (whole and 16 <= texture_size <= 8192):
-        raise ValueError(f"texture_size: expected 16 to 8192 texels, got {texture_size!r}")
-    shown = _Shown(scene, document, embedding, int(texture_size), progress or _silent)
+    size = whole(texture_size, "texture_size", 16)
+    if size > _LARGEST:
+        raise ValueError(f"texture_size: expected up to {_LARGEST} texels, got {texture_size!r}")
+    shown = _Shown(scene, document, embedding, size, progress or _silent)
     return kinds[target.suffix](target, shown)
 
 
 def _silent(stage: str, fraction: float) -> None:
     pass
+
+
+@dataclass(frozen=True)
+class _Fitted(Generic[Look]):
+    """A part in a target's parameters; `textures` (size, size, p) where it is painted locally."""
+
+    piece: Piece
+    look: Look
+    error: float
+    textures: Float64 | None = None
 
 
 class _Shown:
@@ -182,81 +195,75 @@ class _Shown:
                 amounts = SurfaceWeights(scene, places).amounts(varying)
             self.parts.append((piece, varying, texels, amounts))
 
-    def table(self, material: Material) -> TabulatedBRDF:
-        """Return a material as a table."""
-        grid = self.embedding.grid_
-        values = material.values(self.embedding).reshape(*grid.shape, 3)
-        return TabulatedBRDF(grid, values, material.mirror, material.name or "")
-
-    def pairs(self, target: Target[Look], looks: Mapping[str, Look]) -> tuple[Pair, ...]:
-        """Return the parts' materials beside their fits."""
-        return tuple(
-            Pair(part, self.table(self.materials[part]), functools.partial(target.image, look))
-            for part, look in looks.items()
-        )
-
-    def fitted(self, fitter: Fitter[Look]) -> list[tuple[Piece, Look, Baked[Look] | None, Any]]:
-        """Return each part's piece, look and error, and what is baked for its texels."""
-        found: list[tuple[Piece, Look, Baked[Look] | None, Any]] = []
+    def fitted(self, target: Target[Look]) -> list[_Fitted[Look]]:
+        """Return the parts in a target's parameters."""
+        fitter = Fitter(target, self.embedding, fitting_pixels(self.embedding.grid_))
+        found: list[_Fitted[Look]] = []
         for i, (piece, varying, texels, amounts) in enumerate(self.parts):
             self.progress(f"fitting {piece.name}", i / len(self.parts))
             if varying is None or texels is None:
                 one = fitter.material(self.materials[piece.name])
-                found.append((piece, one.look, None, one.error))
+                found.append(_Fitted(piece, one.look, one.error))
                 continue
             baked = fitter.bake(varying, amounts, self.progress)
-            found.append((piece, baked.like, baked, texels.spread(baked.values)))
+            textures = texels.spread(baked.values)
+            found.append(_Fitted(piece, baked.like, baked.error, textures))
         return found
+
+    def exported(
+        self, files: Sequence[Path], target: Target[Look], parts: Sequence[_Fitted[Look]]
+    ) -> Exported:
+        """Return what was written, with the parts' materials beside their fits."""
+        pairs = tuple(
+            Pair(
+                part.piece.name, self.materials[part.piece.name].as_table(self.embedding),
+                functools.partial(target.image, part.look),
+            )
+            for part in parts
+        )  # fmt: skip
+        return Exported(tuple(files), {part.piece.name: part.error for part in parts}, pairs)
 
 
 def _to_glb(path: Path, shown: _Shown) -> Exported:
     target = GltfTarget()
-    fitter = Fitter(target, shown.embedding, fitting_pixels(shown.embedding.grid_))
-    parts, errors, looks = [], {}, {}
-    for piece, look, baked, found in shown.fitted(fitter):
-        errors[piece.name] = found if baked is None else baked.error
-        looks[piece.name] = look
-        parts.append(GltfPart(piece, look, None if baked is None else found))
-    write_glb(path, shown.scene, parts)
-    return Exported((path,), errors, shown.pairs(target, looks))
+    parts = shown.fitted(target)
+    write_glb(path, shown.scene, [GltfPart(one.piece, one.look, one.textures) for one in parts])
+    return shown.exported([path], target, parts)
 
 
 def _to_mtlx(path: Path, shown: _Shown) -> Exported:
     target = OpenPBRTarget()
-    fitter = Fitter(target, shown.embedding, fitting_pixels(shown.embedding.grid_))
-    looks, errors, files, pieces = {}, {}, [path], []
+    parts, files = shown.fitted(target), [path]
     maps: dict[str, dict[str, Path]] = {}
-    for piece, look, baked, found in shown.fitted(fitter):
-        name = piece.name
-        looks[name], errors[name] = look, found if baked is None else baked.error
-        pieces.append(piece)
-        if baked is None:
+    for part in parts:
+        if part.textures is None:
             continue
+        name = part.piece.name
         maps[name] = {}
-        for key, at in columns(look).items():
+        for key, at in columns(part.look).items():
             file = path.with_name(f"{path.stem}_{name}_{key}.exr")
-            values = found[..., at].astype(np.float32)
+            values = part.textures[..., at].astype(np.float32)
             write_exr(file, np.broadcast_to(values, (*values.shape[:2], 3)))
             maps[name][key] = Path(file.name)
             files.append(file)
     if maps:  # the textures need its coordinates
         files.append(path.with_suffix(".obj"))
-        write_obj(files[-1], pieces)
-    write_mtlx(path, looks, maps)
-    return Exported(tuple(files), errors, shown.pairs(target, looks))
+        write_obj(files[-1], [part.piece for part in parts])
+    write_mtlx(path, {part.piece.name: part.look for part in parts}, maps)
+    return shown.exported(files, target, parts)
 
 
 def _to_mitsuba(path: Path, shown: _Shown) -> Exported:
     parts = []
     for piece, varying, texels, amounts in shown.parts:
-        if varying is None or texels is None:
-            parts.append(MitsubaPart(piece, [shown.table(shown.materials[piece.name])]))
-            continue
-        materials, paint = painted_tables(varying, amounts)
-        square = texels.spread(np.stack([paint["cell"], *paint["share"]], axis=1))
-        flat = square.reshape(-1, square.shape[-1]).T
-        whole = {"cell": flat[0], "share": flat[1:], "corners": paint["corners"]}
-        parts.append(MitsubaPart(piece, [shown.table(one) for one in materials], whole))
+        materials, spread = [shown.materials[piece.name]], None
+        if varying is not None and texels is not None:
+            materials, paint = painted_tables(varying, amounts)
+            square = texels.spread(np.stack([paint["cell"], *paint["share"]], axis=1))
+            flat = square.reshape(-1, square.shape[-1]).T
+            spread = {"cell": flat[0], "share": flat[1:], "corners": paint["corners"]}
+        tables = [one.as_table(shown.embedding) for one in materials]
+        parts.append(MitsubaPart(piece, tables, spread))
     write_mitsuba(path, shown.scene, parts)
     errors = dict.fromkeys((part.piece.name for part in parts), 0.0)
     return Exported((path, path.with_suffix(".npz")), errors)

@@ -191,9 +191,7 @@ class EditSession(Viewer):
                 other = "nothing" if seen is None else repr(seen.part)
                 raise ValueError(f"at: expected a pixel that shows {part!r}, got {other} at {at}")
             material = seen.material
-        grid = self.embedding.grid_
-        values = material.values(self.embedding).reshape(*grid.shape, 3)
-        return TabulatedBRDF(grid, values, material.mirror, material.name or part)
+        return material.as_table(self.embedding, part)
 
     def pick(self, x: float, y: float) -> Picked | None:
         """Return what is seen at a place of the image; None where no part is.

@@ -133,6 +133,19 @@ class Material:
             self.__dict__["_fitted"] = known
         return known[1]
 
+    def as_table(self, embedding: BRDFEmbedding, name: str = "") -> TabulatedBRDF:
+        """Return the material as a table on the embedding's grid.
+
+        Parameters
+        ----------
+        embedding : BRDFEmbedding
+        name : str
+            Of the table, if the material has none.
+        """
+        grid = embedding.grid_
+        values = self.values(embedding).reshape(*grid.shape, 3)
+        return TabulatedBRDF(grid, values, self.mirror, self.name or name)
+
     def values(self, embedding: BRDFEmbedding, cells: Int64 | None = None) -> Float32:
         """Return f_r in 1/sr at cells of the embedding's grid.
 
