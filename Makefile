@@ -23,12 +23,13 @@ $(STAMP): pyproject.toml
 peers: venv
 	$(BIN)/python -m pip install --quiet --editable ".[peers]"
 
-# A browser and JupyterLab for tests/test_browser.py, where they can be installed.
+# A browser and JupyterLab for tests/test_browser.py, where they can be installed; what checks
+# exported glTF files, at fixed versions: before 0.181 three.js did not filter maps by GGX.
 browser: venv
 	$(BIN)/python -m pip install --quiet --editable ".[browser]" \
 		|| echo "make: no playwright or jupyterlab: the browser tests are skipped"
 	@command -v npm >/dev/null && npm install --silent --no-fund --no-audit --prefix $(VENV)/npm \
-		gltf-validator@2 three@0.180 >/dev/null || echo "make: no npm: exported glTF files are not validated"
+		gltf-validator@2.0.0-dev.3.10 three@0.187.0 >/dev/null || echo "make: no npm: exported glTF files are not validated"
 	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
 		&& apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
 		apt-get install -y -qq --no-install-recommends chromium >/dev/null; } \
