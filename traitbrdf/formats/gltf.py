@@ -65,9 +65,10 @@ def read_gltf(path: Path) -> list[Piece]:
     # what stands where is not checked field by field
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError,
             RecursionError) as error:  # fmt: skip
-        raise FormatError(
-            path, f"a readable {path.suffix.lower()} file", f"{type(error).__name__}: {error}"
-        ) from error
+        got = f"a value of another type than the specification's ({error})"
+        if isinstance(error, KeyError):
+            got = f"no {error} where the specification requires it"
+        raise FormatError(path, f"a readable {path.suffix.lower()} file", got) from error
 
 
 def _document(path: Path) -> tuple[dict[str, Any], bytes | None]:
@@ -260,7 +261,8 @@ class _File:
             if not isinstance(self.document.get(group, []), list):
                 self.refuse(f"{group} that are no list of a {what} each")
         if "nodes" not in self.document:
-            self.document["nodes"] = [{"mesh": i} for i in range(len(self.document["meshes"]))]
+            meshes = self.document.get("meshes", [])
+            self.document["nodes"] = [{"mesh": i} for i in range(len(meshes))]
         places = self.places()
         names = self.names()
         made: dict[int, list[tuple[str, dict[str, Any]]]] = {}
@@ -344,7 +346,7 @@ class _File:
 
         A mesh of several primitives has one part for each of its materials.
         """
-        meshes = self.document["meshes"]
+        meshes = self.document.get("meshes", [])
         materials = self.document.get("materials", [])
         nodes = {n["mesh"]: n.get("name") for n in self.document["nodes"] if "mesh" in n}
         unnamed = "mesh {}" if len(meshes) > 1 else ""
