@@ -62,19 +62,24 @@ class Fitter(Generic[Look]):
         self, target: Target[Look], embedding: BRDFEmbedding, pixels: FittingPixels
     ) -> None:
         self.target, self.embedding, self.pixels = target, embedding, pixels
-        self._known: dict[Material, Fit[Look]] = {}
+        self._known: dict[tuple[Material, bool], Fit[Look]] = {}
 
-    def material(self, material: Material, near: Sequence[Float64] = ()) -> Fit[Look]:
+    def material(
+        self, material: Material, near: Sequence[Float64] = (), further: bool = True
+    ) -> Fit[Look]:
         """Fit one material.
 
         Parameters
         ----------
         material : Material
         near : vectors of looks that are probably near
+        further : bool
+            As for `traitbrdf.export.fitting.fit`.
         """
-        if material not in self._known:
-            self._known[material] = fit(self.target, self.pixels, self._seen(material), near)
-        return self._known[material]
+        key = material, further
+        if key not in self._known:
+            self._known[key] = fit(self.target, self.pixels, self._seen(material), near, further)
+        return self._known[key]
 
     def bake(self, varying: Varying, amounts: Float32, progress: Progress) -> Baked[Look]:
         """Fit a material that varies.
@@ -91,7 +96,8 @@ class Fitter(Generic[Look]):
         for done, name in enumerate(sorted(weights, key=lambda one: (sum(one), one))):
             progress(f"fitting {varying.part}", done / len(weights))
             material = varying.material([float(knots[i, at]) for i, at in enumerate(name)])
-            fits[name] = self.material(material, _beside(fits, name))
+            # an index of a film cannot be a texture
+            fits[name] = self.material(material, _beside(fits, name), further=False)
         like = next(iter(fits.values())).look
         values = np.zeros((amounts.shape[1], len(as_values(like))))
         for name, (rows, part_of) in weights.items():

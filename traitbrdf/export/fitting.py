@@ -19,6 +19,8 @@ Look = TypeVar("Look")
 _ROUGH = (0.06, 0.15, 0.32, 0.6)  # roughness that fits start from
 _HELD_OUT = 2  # lights that a fit does not see, and that its error is measured under
 _FIRST, _LAST = 12, 60  # evaluations: of all starts, and of the best
+_FAR = 0.03  # error from which further starts are tried
+_BETTER = 0.7  # share of the cost that makes them worth it
 
 
 class Target(Protocol[Look]):
@@ -37,6 +39,9 @@ class Target(Protocol[Look]):
 
     def starts(self, colour: Float64, roughness: float) -> Iterable[Float64]:
         """Return vectors to start from: a surface of a colour (3,) and a roughness."""
+
+    def further(self, vector: Float64) -> Iterable[Float64]:
+        """Return vectors to try if the best of `starts` has come to this vector, and is far off."""
 
     def cost(self, vector: Float64) -> Float64:
         """Return residuals (r,) of what is asked beside the picture, such as no needless coat."""
@@ -65,6 +70,7 @@ def fit(
     pixels: FittingPixels,
     seen: Float64,
     near: Iterable[Float64] = (),
+    further: bool = True,
 ) -> Fit[Look]:
     """Fit a target's model to the pixels that a table shows.
 
@@ -78,6 +84,8 @@ def fit(
     seen : (m, 3) float64
         Their radiance under the table.
     near : vectors (n,) of looks that are probably near; a few steps from them are then enough
+    further : bool
+        Whether to try what the target has for materials that its usual looks are far from.
 
     Returns
     -------
@@ -107,9 +115,16 @@ def fit(
         first = [solve(start, _FIRST) for rough in _ROUGH for start in target.starts(colour, rough)]
         first.sort(key=lambda one: one[0])
         first = [solve(vector, _LAST) for _, vector in first[:2]]
-    vector = min(first, key=lambda one: one[0])[1]
-    look = target.look(vector)
-    return Fit(look, vector, error_of(target, look, pixels, seen))
+    cost, vector = min(first, key=lambda one: one[0])
+    error = error_of(target, target.look(vector), pixels, seen)
+    if further and error > _FAR:
+        others = sorted((solve(s, _FIRST) for s in target.further(vector)), key=lambda one: one[0])
+        others = [solve(other, _LAST) for _, other in others[:2]]
+        best = min(others, default=(cost, vector), key=lambda one: one[0])
+        if best[0] < _BETTER * cost:
+            vector = best[1]
+            error = error_of(target, target.look(vector), pixels, seen)
+    return Fit(target.look(vector), vector, error)
 
 
 def error_of(target: Target[Look], look: Look, pixels: FittingPixels, seen: Float64) -> float:

@@ -1,11 +1,13 @@
 """The metallic-roughness model of glTF 2.0 and its ratified extensions, and `.glb` files.
 
 The model is that of the specification's appendix B with `KHR_materials_ior`, `_specular`,
-`_clearcoat` and `_sheen`. Materials here are isotropic, so that `_anisotropy` has nothing to say.
+`_clearcoat`, `_sheen` and `_iridescence`. Materials here are isotropic, so that `_anisotropy` has
+nothing to say.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import struct
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from traitbrdf.export.baking import columns
-from traitbrdf.export.lobes import ALPHAS, SHEENS, Pixels
+from traitbrdf.export.lobes import ALPHAS, ANGLES, SHEENS, Pixels
 from traitbrdf.export.pieces import Piece
 from traitbrdf.formats.display import encode_srgb
 from traitbrdf.formats.files import atomic_path
@@ -31,7 +33,18 @@ RGB = tuple[float, float, float]
 
 _DENSEST = 2.5  # index of refraction; a greater F0 is a tint
 _COAT_F0 = 0.04  # that of an index of 1.5
-_VISIBLE = 2e-3  # a weaker coat or sheen is left out
+_VISIBLE = 2e-3  # a weaker coat, sheen or film is left out
+_THICKEST = 1000.0  # film, nm
+_FILM_IORS = (1.4, 2.0)  # that fits start from
+_FILM_NM = (150.0, 300.0, 450.0, 600.0, 800.0)
+_PEAKS = np.array([5.4856e-13, 4.4201e-13, 5.2481e-13])  # of the CIE's curves as Gaussians
+_PLACES = np.array([1.6810e6, 1.7953e6, 2.2084e6])
+_WIDTHS = np.array([4.3278e9, 9.3046e9, 6.6121e9])
+_TO_REC709 = np.array([
+    [3.2404542, -0.9692660, 0.0556434],
+    [-1.5371385, 1.8760108, -0.2040259],
+    [-0.4985314, 0.0415560, 1.0572252],
+]).T  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,6 +62,11 @@ class GltfLook:
     clearcoat, clearcoat_roughness : float in [0, 1]
     sheen_color : RGB in [0, 1]
     sheen_roughness : float in [0, 1]
+    iridescence : float in [0, 1]
+        Weight of a thin film.
+    iridescence_ior : float in [1, 3]
+    iridescence_thickness : float
+        Of the film, nm.
     """
 
     base_color: RGB
@@ -60,6 +78,9 @@ class GltfLook:
     clearcoat_roughness: float = 0.0
     sheen_color: RGB = (0.0, 0.0, 0.0)
     sheen_roughness: float = 0.5
+    iridescence: float = 0.0
+    iridescence_ior: float = 1.3
+    iridescence_thickness: float = 400.0
 
     @property
     def ior(self) -> float:
@@ -78,10 +99,10 @@ class GltfLook:
 class GltfTarget:
     """`GltfLook` as a `traitbrdf.export.fitting.Target`."""
 
-    size = 16
+    size = 18
 
     def look(self, vector: Float64) -> GltfLook:
-        """Return the parameters of a vector (16,) in [0, 1]."""
+        """Return the parameters of a vector (18,) in [0, 1]."""
         v = [float(x) for x in vector]
         return GltfLook(
             base_color=(v[0] ** 2, v[1] ** 2, v[2] ** 2),
@@ -93,6 +114,9 @@ class GltfTarget:
             clearcoat_roughness=_roughness(v[10]),
             sheen_color=(v[11] ** 2, v[12] ** 2, v[13] ** 2),
             sheen_roughness=math.sqrt(SHEENS[0]) + (1.0 - math.sqrt(SHEENS[0])) * v[14],
+            iridescence=v[15],
+            iridescence_ior=1.0 + 2.0 * v[16],
+            iridescence_thickness=_THICKEST * v[17],
         )
 
     def starts(self, colour: Float64, roughness: float) -> Iterator[Float64]:
@@ -101,6 +125,7 @@ class GltfTarget:
         plain = np.full(self.size, 0.01)
         plain[:3], plain[4], plain[5:8], plain[8] = root, roughness, 0.2, 0.9
         plain[10], plain[14] = 0.2, 0.5
+        plain[15], plain[16], plain[17] = 0.0, 0.2, 0.4
         yield plain
         metal = plain.copy()
         metal[3] = 0.98
@@ -113,25 +138,38 @@ class GltfTarget:
         cloth[11:14], cloth[8], cloth[14] = 0.4 * root, 0.3, roughness
         yield cloth
 
+    def further(self, vector: Float64) -> Iterator[Float64]:
+        """Return vectors of the same look under thin films."""
+        for metal, ior, thickness in itertools.product((0.02, 0.9), _FILM_IORS, _FILM_NM):
+            film = vector.copy()
+            film[3] = metal
+            film[15], film[16], film[17] = 0.7, 0.5 * (ior - 1.0), thickness / _THICKEST
+            yield film
+
     def cost(self, vector: Float64) -> Float64:
-        """Return residuals (6,): coat and sheen only where they show, metal or none."""
+        """Return residuals (7,): coat, sheen and film only where they show, metal or none."""
         between_both = vector[3] * (1.0 - vector[3])
-        return 0.003 * np.array([vector[9], *vector[11:14], between_both, 1.0 - vector[8]])
+        some = [vector[9], *vector[11:14], between_both, 1.0 - vector[8], vector[15]]
+        return 0.003 * np.array(some)
 
     def image(self, look: GltfLook, pixels: Pixels) -> Float64:
         """Return the radiance (m, 3) of pixels, as the specification's appendix B has it."""
         alpha = look.roughness**2
         base = np.array(look.base_color)
-        lobe = pixels.ggx(alpha)
-        constant, grazing = lobe[:, :1], lobe[:, 1:2]
-        metal = base * constant + (1.0 - base) * grazing
         f0 = np.array(look.f0)
-        reflected = look.specular * (f0 * constant + (1.0 - f0) * grazing)
-        most = look.specular * float(f0.max())
-        rest = look.specular - most  # what is added towards grazing angles
-        body = (1.0 - most) * pixels.diffuse()[:, :1] - rest * pixels.diffuse()[:, 1:2]
-        dielectric = base * body + reflected
-        image = look.metallic * metal + (1.0 - look.metallic) * dielectric
+        grazing = (1.0 - ANGLES[:, None]) ** 5
+        metal = base + (1.0 - base) * grazing
+        surface = f0 + (1.0 - f0) * grazing
+        film = look.iridescence
+        if film > 1e-3:
+            ior, thickness = look.iridescence_ior, look.iridescence_thickness
+            metal = (1.0 - film) * metal + film * thin_film(ANGLES, ior, thickness, base)
+            surface = (1.0 - film) * surface + film * thin_film(ANGLES, ior, thickness, f0)
+        surface = look.specular * surface
+        through = np.maximum(1.0 - surface.max(axis=1, keepdims=True), 0.0)
+        lobe = pixels.ggx(alpha)
+        dielectric = lobe @ surface + base * (pixels.diffuse() @ through)
+        image = look.metallic * (lobe @ metal) + (1.0 - look.metallic) * dielectric
         sheen = np.array(look.sheen_color)
         if sheen.max() > 1e-4:
             rough = look.sheen_roughness**2
@@ -140,10 +178,60 @@ class GltfTarget:
             image = image * left[:, None] + sheen * fibres[:, None]
         if look.clearcoat > 1e-4:
             fresnel = _COAT_F0 + (1.0 - _COAT_F0) * (1.0 - pixels.cosine) ** 5
-            coat = pixels.ggx(look.clearcoat_roughness**2)[:, 0]
+            coat = pixels.ggx(look.clearcoat_roughness**2).sum(axis=1)
             weight = (look.clearcoat * fresnel)[:, None]
             image = image * (1.0 - weight) + weight * coat[:, None]
         return np.asarray(image, np.float64)
+
+
+def thin_film(cosine: Float64, ior: float, thickness: float, f0: Float64) -> Float64:
+    """Return the Fresnel term (m, 3) of a base under a thin film, as `KHR_materials_iridescence`.
+
+    Belcour & Barla, "A Practical Extension to Microfacet Theory for the Modeling of Varying
+    Iridescence" (2017), with Schlick's terms and two orders of interference.
+
+    Parameters
+    ----------
+    cosine : (m,) float64, of the angle of difference
+    ior : float
+        Of the film, at least 1.
+    thickness : float
+        nm. A film of 0 nm has the index of air, so that the base is nearly as it is without.
+    f0 : (3,) float64 in [0, 1]
+        Of the base in air.
+    """
+    t = min(max(thickness / 0.03, 0.0), 1.0)
+    ior = 1.0 + (ior - 1.0) * t * t * (3.0 - 2.0 * t)
+    inside = np.sqrt(1.0 - (1.0 - cosine**2) / ior**2)[:, None]
+    away = (1.0 - cosine[:, None]) ** 5
+    flat = ((ior - 1.0) / (ior + 1.0)) ** 2
+    top = flat + (1.0 - flat) * away
+    root = np.sqrt(np.clip(f0, 0.0, 0.9999))
+    base = (1.0 + root) / (1.0 - root)
+    below = ((base - ior) / (base + ior)) ** 2
+    below = below + (1.0 - below) * (1.0 - inside) ** 5
+    turn = np.where(base < ior, 2.0 * math.pi, math.pi)  # of phase, at both interfaces
+    both = np.clip(top * below, 1e-5, 0.9999)
+    returned = (1.0 - top) ** 2 * below / (1.0 - both)
+    found = top + returned
+    wave = returned - (1.0 - top)
+    for order in (1, 2):
+        wave = wave * np.sqrt(both)
+        phase = 2.0 * math.pi * 1e-9 * order * 2.0 * ior * thickness * inside
+        found = found + wave * 2.0 * _sensitivity(phase, order * turn)
+    return np.asarray(np.maximum(found, 0.0))
+
+
+def _sensitivity(phase: Float64, turn: Float64) -> Float64:
+    """Return what eyes see (m, 3) of a cosine over wave numbers, in linear Rec.709.
+
+    Belcour & Barla's Gaussians of the CIE's curves, for phases (m, 1) and shifts (3,).
+    """
+    found = _PEAKS * np.sqrt(2.0 * math.pi * _WIDTHS) * np.cos(_PLACES * phase + turn)
+    found = found * np.exp(-(phase**2) * _WIDTHS)
+    second = math.sqrt(2.0 * math.pi * 4.5282e9) * np.cos(2.2399e6 * phase[:, 0] + turn[0])
+    found[:, 0] += 9.7470e-14 * second * np.exp(-4.5282e9 * phase[:, 0] ** 2)
+    return np.asarray(found / 1.0685e-7 @ _TO_REC709.T)
 
 
 def _roughness(value: float) -> float:
@@ -304,6 +392,13 @@ class _File:
             extensions["KHR_materials_ior"] = {"ior": look.ior}
             specular["specularColorFactor"] = list(look.specular_color)
             coated, fuzzy = look.clearcoat > _VISIBLE, max(look.sheen_color) > _VISIBLE
+            if look.iridescence > _VISIBLE:
+                extensions["KHR_materials_iridescence"] = {
+                    "iridescenceFactor": look.iridescence,
+                    "iridescenceIor": look.iridescence_ior,
+                    "iridescenceThicknessMinimum": look.iridescence_thickness,
+                    "iridescenceThicknessMaximum": look.iridescence_thickness,
+                }
         else:
             at = {name: maps[..., place] for name, place in columns(look).items()}
             core["baseColorFactor"] = [1.0] * 4

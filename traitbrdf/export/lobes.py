@@ -38,6 +38,10 @@ SHEENS: Float64 = np.geomspace(0.07, 1.0, 17)
 FUZZES: Float64 = np.geomspace(0.1, 1.0, 15)
 """Roughness of the lobes of fuzz."""
 
+ANGLES: Float64 = np.linspace(0.0, 1.0, 17) ** 1.5
+"""Cosines of the angle of difference that lobes are told apart by; Fresnel terms are taken as
+linear in between."""
+
 _LIGHTS = 6
 _PIXELS = 60  # of each light
 _SIZE = 48
@@ -74,10 +78,9 @@ class Pixels(ABC):
         return self.images(values) + self.mirror[:, None] * mirror
 
     def ggx(self, alpha: float) -> Float64:
-        """Return the images (m, 3) of a GGX lobe times 1, (1 - c)^5 and c (1 - c)^6.
+        """Return the images (m, angles) of a GGX lobe, told apart by `ANGLES`.
 
-        c is the cosine of the angle of difference; Schlick's Fresnel term is a sum of the first
-        two, and the third bends it (Hoffman, "Fresnel Equations Considered Harmful", 2019).
+        Times the values of a Fresnel term there, they are the image of the lobe with that term.
         """
         return self._of_lobe(ggx_lobe(self._wi, self._wo, alpha))
 
@@ -94,7 +97,7 @@ class Pixels(ABC):
         return self.images(lobe.reshape(-1, 1).astype(np.float32))[:, 0]
 
     def ggx_albedo(self, alpha: float) -> Float64:
-        """Return the directional albedos (m, 3) of the lobes of `ggx` at the pixels' views."""
+        """Return the directional albedos (m, angles) of the lobes of `ggx` at the pixels' views."""
         return ggx_albedo(self.cosine, alpha)
 
     def sheen_albedo(self, alpha: float) -> Float64:
@@ -102,17 +105,17 @@ class Pixels(ABC):
         return sheen_albedo(self.cosine, alpha)
 
     def diffuse(self) -> Float64:
-        """Return the images (m, 3) of 1/pi times the three terms of `ggx`."""
+        """Return the images (m, angles) of 1/pi, told apart as those of `ggx`."""
         return self._of_lobe(np.full(self.grid.shape, 1.0 / math.pi))
 
     def _of_lobe(self, lobe: Float64) -> Float64:
-        tables = np.stack([(lobe * term).ravel() for term in self._fresnel], axis=1)
-        return self.images(tables.astype(np.float32))
+        return self.images((lobe.reshape(-1, 1) * self._near).astype(np.float32))
 
     @functools.cached_property
-    def _fresnel(self) -> list[Float64]:
-        cosine = np.sqrt(0.5 * (1.0 + (self._wi * self._wo).sum(axis=-1)))
-        return fresnel_terms(np.clip(cosine, 0.0, 1.0))
+    def _near(self) -> Float64:
+        """How much (cells, angles) of a cell belongs to each of the angles."""
+        cosine = np.sqrt(0.5 * (1.0 + (self._wi * self._wo).sum(axis=-1))).ravel()
+        return np.stack([np.interp(cosine, ANGLES, one) for one in np.eye(len(ANGLES))], axis=1)
 
 
 class FittingPixels(Pixels):
@@ -162,7 +165,7 @@ class FittingPixels(Pixels):
         return self._mirror
 
     def ggx(self, alpha: float) -> Float64:
-        """Interpolate the images (m, 3) of a GGX lobe; `Pixels.ggx` computes them."""
+        """Interpolate the images (m, angles) of a GGX lobe; `Pixels.ggx` computes them."""
         return _between(ALPHAS, self._ggx[0], alpha)
 
     def sheen(self, alpha: float) -> Float64:
@@ -170,7 +173,7 @@ class FittingPixels(Pixels):
         return _between(SHEENS, self._sheen[0], alpha)
 
     def diffuse(self) -> Float64:
-        """Return the images (m, 3) of 1/pi times the three terms of `ggx`; they are kept."""
+        """Return the images (m, angles) of 1/pi, told apart as those of `ggx`; they are kept."""
         return self._diffuse
 
     @functools.cached_property
@@ -182,7 +185,7 @@ class FittingPixels(Pixels):
         return _between(FUZZES, self._fuzz, roughness)
 
     def ggx_albedo(self, alpha: float) -> Float64:
-        """Interpolate the directional albedos (m, 3) of the lobes of `ggx`."""
+        """Interpolate the directional albedos (m, angles) of the lobes of `ggx`."""
         return _between(ALPHAS, self._ggx[1], alpha)
 
     def sheen_albedo(self, alpha: float) -> Float64:
@@ -267,14 +270,8 @@ class PicturePixels(Pixels):
         return whole.reshape(side, side, 3)
 
 
-def fresnel_terms(cosine: Float64) -> list[Float64]:
-    """Return 1, (1 - c)^5 and c (1 - c)^6 of cosines."""
-    away = np.clip(1.0 - cosine, 0.0, 1.0)
-    return [np.ones_like(away), away**5, cosine * away**6]
-
-
 def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
-    """Return directional albedos (m, 3) of a GGX lobe times the three terms of `fresnel_terms`.
+    """Return directional albedos (m, angles) of a GGX lobe, told apart by `ANGLES`.
 
     Parameters
     ----------
@@ -286,7 +283,7 @@ def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
     slope = alpha * np.sqrt(u / (1.0 - u))
     sine, up = slope / np.sqrt(1.0 + slope**2), 1.0 / np.sqrt(1.0 + slope**2)
     h = np.stack([sine * np.cos(turn), sine * np.sin(turn), up], axis=-1)
-    found = np.empty((len(cosine), 3))
+    found = np.zeros((len(cosine), len(ANGLES)))
     for i, c in enumerate(cosine):
         wo = np.array([math.sqrt(max(1.0 - c * c, 0.0)), 0.0, c])
         along = np.maximum(h @ wo, 0.0)
@@ -297,7 +294,11 @@ def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
             low * np.sqrt(a2 + (1.0 - a2) * c * c) + c * np.sqrt(a2 + (1.0 - a2) * low * low)
         )  # fmt: skip
         weight = np.where(z > 0.0, g * along / (h[:, 2] * c), 0.0)
-        found[i] = [(weight * term).mean() for term in fresnel_terms(along)]
+        place = np.interp(along, ANGLES, np.arange(len(ANGLES)))
+        low = np.minimum(place.astype(np.int64), len(ANGLES) - 2)
+        share = place - low
+        for node, part_of in ((low, 1.0 - share), (low + 1, share)):
+            found[i] += np.bincount(node, weight * part_of, len(ANGLES)) / len(weight)
     return found
 
 
@@ -329,7 +330,7 @@ def fuzz_lobe(wi: Float64, wo: Float64, roughness: float) -> Float64:
     z = np.maximum(wi[..., 2], 1e-6)
     length = (a * along + b * z) ** 2 + (a * across) ** 2 + z * z
     # the density contains the cosine, which the reflection equation multiplies by again
-    found: Float64 = fuzz_albedo(x, y) * (a / length) ** 2 / math.pi
+    found: Float64 = np.maximum(fuzz_albedo(x, y), 0.0) * (a / length) ** 2 / math.pi
     return found
 
 

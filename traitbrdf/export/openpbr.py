@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from traitbrdf.export.lobes import ALPHAS, Pixels, fresnel_terms, fuzz_albedo
+from traitbrdf.export.lobes import ALPHAS, ANGLES, Pixels, fuzz_albedo
 from traitbrdf.formats.files import atomic_path
 from traitbrdf.reflectance.models import fresnel_dielectric
 
@@ -103,6 +103,10 @@ class OpenPBRTarget:
         cloth[15], cloth[8], cloth[14] = 0.4, 0.1, roughness
         yield cloth
 
+    def further(self, _vector: Float64) -> Iterator[Float64]:
+        """Return no vectors: films are not written."""
+        return iter(())
+
     def cost(self, vector: Float64) -> Float64:
         """Return residuals (6,): coat and fuzz only where they show, metal or none, no tint."""
         between = vector[3] * (1.0 - vector[3])
@@ -117,21 +121,23 @@ class OpenPBRTarget:
         ratio = look.specular_ior / _COAT_IOR
         ior = coat * max(ratio, 1.0 / ratio) + (1.0 - coat) * look.specular_ior
         lobe, albedo = pixels.ggx(alpha), pixels.ggx_albedo(alpha)
-        missing = (1.0 - albedo[:, 0]) / albedo[:, 0]
+        missing = _missing(albedo)
         reflected, through = _dielectric(lobe, albedo, missing, ior)
         base, tint = np.array(look.base_color), np.array(look.specular_color)
-        dielectric = base * (through * pixels.diffuse()[:, 0])[:, None] + tint * reflected[:, None]
-        # Hoffman's form of Schlick's term, with the tint at 82 degrees
-        edge = 1.0 / 7.0
+        dielectric = (
+            base * (through * pixels.diffuse().sum(axis=1))[:, None] + tint * reflected[:, None]
+        )
+        # Schlick's term, bent so that the tint is right at 82 degrees: Hoffman, "Fresnel Equations
+        # Considered Harmful" (2019)
+        edge, away = 1.0 / 7.0, (1.0 - ANGLES[:, None])
         bend = (base + (1.0 - base) * (1.0 - edge) ** 5) * (1.0 - tint) / (edge * (1.0 - edge) ** 6)
-        metal = base * lobe[:, :1] + (1.0 - base) * lobe[:, 1:2] - bend * lobe[:, 2:3]
-        metal = np.maximum(metal, 0.0) * (1.0 + base * missing[:, None])
+        fresnel = base + (1.0 - base) * away**5 - bend * ANGLES[:, None] * away**6
+        metal = lobe @ np.maximum(fresnel, 0.0) * (1.0 + base * missing[:, None])
         image = look.base_metalness * metal + (1.0 - look.base_metalness) * dielectric
         if coat > 1e-4:
             alpha = look.coat_roughness**2
             lobe, albedo = pixels.ggx(alpha), pixels.ggx_albedo(alpha)
-            missing = (1.0 - albedo[:, 0]) / albedo[:, 0]
-            reflected, through = _dielectric(lobe, albedo, missing, _COAT_IOR)
+            reflected, through = _dielectric(lobe, albedo, _missing(albedo), _COAT_IOR)
             image = image * (1.0 - coat * (1.0 - through))[:, None] + coat * reflected[:, None]
         if look.fuzz_weight > 1e-4:
             fibres = pixels.fuzz(look.fuzz_roughness)
@@ -146,29 +152,20 @@ def _dielectric(
 ) -> tuple[Float64, Float64]:
     """Return the images (m,) of a dielectric's reflection, and the share (m,) that it lets through.
 
-    `lobe` and `albedo` (m, 3) are a GGX lobe's, `missing` (m,) is the share of light that bounces
-    more than once, which MaterialX adds.
+    `lobe` and `albedo` (m, angles) are a GGX lobe's, `missing` (m,) is `_missing` of it. What is
+    let through is by Schlick's term there, and what is reflected by Fresnel's equations.
     """
     f0 = ((ior - 1.0) / (ior + 1.0)) ** 2
     more = 1.0 + f0 * missing
-    through = np.clip(1.0 - (f0 * albedo[:, 0] + (1.0 - f0) * albedo[:, 1]) * more, 0.0, 1.0)
-    return np.maximum(lobe @ _fresnel_of(ior), 0.0) * more, through
+    schlick = f0 + (1.0 - f0) * (1.0 - ANGLES) ** 5
+    through = np.clip(1.0 - albedo @ schlick * more, 0.0, 1.0)
+    return lobe @ fresnel_dielectric(ANGLES, ior) * more, through
 
 
-def _fresnel_of(ior: float) -> Float64:
-    """Return weights (3,) of `fresnel_terms` that fit Fresnel's equations for an index."""
-    indices, weights = _fresnel_table()
-    return np.array([np.interp(ior, indices, column) for column in weights.T])
-
-
-@functools.cache
-def _fresnel_table() -> tuple[Float64, Float64]:
-    cosine = (np.arange(64) + 0.5) / 64
-    terms = np.stack(fresnel_terms(cosine), axis=1)
-    indices = np.linspace(1.0, _DENSEST, 41)
-    exact = np.stack([fresnel_dielectric(cosine, eta) for eta in indices], axis=1)
-    weights: Float64 = np.linalg.lstsq(terms, exact, rcond=None)[0].T.astype(np.float64)
-    return indices, weights
+def _missing(albedo: Float64) -> Float64:
+    """Return what bounces more than once (m,), over the albedo; MaterialX adds it."""
+    whole = albedo.sum(axis=1)
+    return np.asarray((1.0 - whole) / whole)
 
 
 # -- files ----------------------------------------------------------------------------------------
