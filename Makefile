@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: venv peers browser demo test test-slow lint types unit live notebooks bench library clean
+.PHONY: venv peers browser demo test test-slow fuzz lint types unit live notebooks bench library clean
 
 venv: $(STAMP)
 
@@ -55,6 +55,11 @@ unit: venv
 # Whatever takes more than a few seconds: real browsers, whole benches, a rebuild of the artifact.
 test-slow: browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+# Feed every reader 10,000 damaged files: some 40 minutes, for EXR files most of all.
+fuzz: venv
+	TRAITBRDF_MUTATIONS=10000 $(BIN)/python -m pytest -n 2 --dist worksteal \
+		tests/test_damaged_files.py -k many
 
 bench: venv
 	$(BIN)/traitbrdf bench

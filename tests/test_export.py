@@ -563,25 +563,65 @@ def test_mtlx_is_valid_and_says_what_was_fitted(files):
     assert names == {f"/{part}" for part in files["mtlx"].errors}
 
 
-@pytest.mark.slow
-def test_mitsuba_shows_what_the_oracle_shows(painted, files):
+@pytest.fixture(scope="module")
+def peer():
+    """Mitsuba, or the test is skipped."""
     from traitbrdf.bench import peers
 
     try:
-        peer = peers.load()
+        return peers.load()
     except RuntimeError as error:
         if os.environ.get("CI") == "true":
             raise
         pytest.skip(str(error))
-    path = files["py"].files[0]
+
+
+def loaded(path):
+    """What the program of an exported scene makes of its tables."""
     spec = importlib.util.spec_from_file_location("exported_scene", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    theirs = module.load(path.with_suffix(".npz"))
-    scene = painted.scene
-    covers = np.bincount(scene.pixels, minlength=64 * 64)
+    return module.load(path.with_suffix(".npz"))
+
+
+def interior(scene, count):
+    """Some fragments whose pixels see nothing else."""
+    covers = np.bincount(scene.pixels, minlength=scene.height * scene.width)
     inside = np.flatnonzero((covers[scene.pixels] == 1) & ~scene.bordering)
-    chosen = np.random.default_rng(0).choice(inside, 60, replace=False)
+    return np.random.default_rng(0).choice(inside, count, replace=False)
+
+
+@pytest.mark.slow
+def test_mitsuba_shows_the_frame(peer, tmp_path):
+    from traitbrdf.bench import peers
+
+    scene = tb.Scene(tb.teapot(), lights=[tb.PointLight((2, 3, 2))], size=96)
+    edit = tb.EditSession(scene)
+    edit.assign(scene.shape.parts, "red-rubber")
+    edit.assign("lid", "gold-polished")
+    edit.assign("handle", "blue-plastic")
+    edit.assign("spout", "gold-satin")
+    line = tb.Stroke([(33, 54), (60, 54)], radius=10)
+    edit.paint(line, tb.Move(shiny=0.6), where="local")
+    theirs = loaded(edit.export(tmp_path / "pot.py", texture_size=512).files[0])
+    chosen = interior(scene, 500)
+    # twice, so that the noise is known
+    pixels = scene.pixels[chosen]
+    once, again = (peers.traced(peer, theirs, scene, pixels, 16384, seed) for seed in (0, 1))
+    traced = 0.5 * (once + again)
+    frame = edit.render().reshape(-1, 3)[pixels]
+    off = np.abs(frame - traced).mean() / traced.mean()
+    noise = 0.5 * np.abs(once - again).mean() / traced.mean()
+    print(f"the frame is {100 * off:.2f} % off Mitsuba's, whose noise is {100 * noise:.2f} %")
+    assert off < 0.005
+
+
+@pytest.mark.slow
+def test_mitsuba_shows_what_the_oracle_shows(peer, painted, files):
+    from traitbrdf.bench import peers
+
+    theirs, scene = loaded(files["py"].files[0]), painted.scene
+    chosen = interior(scene, 60)
     traced = peers.traced(peer, theirs, scene, scene.pixels[chosen], 4096, 0)
     y, x = np.divmod(scene.pixels[chosen], 64)
     exact = np.empty((60, 3))
