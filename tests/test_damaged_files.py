@@ -164,6 +164,41 @@ def feed(tmp_path, capfd, name, count):
     assert capfd.readouterr() == ("", "")
 
 
+# -- what the mutations found ----------------------------------------------------------------------
+
+
+def test_a_property_that_comes_twice_is_named(tmp_path):
+    path = tmp_path / "a.ply"
+    ply(path)
+    header, rest = path.read_bytes().split(b"end_header")
+    path.write_bytes(header.replace(b" y\n", b" x\n") + b"end_header" + rest)
+    with pytest.raises(FormatError, match="property 'x' of 'vertex' twice"):
+        tb.load_mesh(path)
+
+
+def test_members_that_are_no_arrays_are_named(tmp_path):
+    path = tmp_path / "a.npz"
+    npz(path)
+    with zipfile.ZipFile(path) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    with zipfile.ZipFile(path, "w") as file:
+        for name, data in members.items():
+            file.writestr(name, b"text" if name == "values.npy" else data)
+    with pytest.raises(FormatError, match="'values' is no array"):
+        tb.TabulatedBRDF.read(path)
+
+
+@pytest.mark.parametrize("given", [{"rotation": [0, 0, 0, 0]}, {"scale": [float("inf"), 1, 1]}])
+def test_transforms_that_end_in_no_number_are_named(tmp_path, given):
+    path = tmp_path / "a.glb"
+    writer = Writer()
+    one = {"attributes": {"POSITION": writer.accessor(SQUARE)}, "indices": writer.accessor(TWO)}
+    writer.node(mesh=writer.mesh([one]), **given)
+    writer.write(path)
+    with pytest.raises(FormatError, match="not finite"):
+        tb.load_mesh(path)
+
+
 # -- sizes that lie -------------------------------------------------------------------------------
 
 

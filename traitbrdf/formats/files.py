@@ -211,7 +211,11 @@ def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
                 )
             file.seek(0)
             with np.load(file, allow_pickle=False) as data:
-                return {name: data[name] for name in data.files}
+                arrays = {name: data[name] for name in data.files}
+        for name, value in arrays.items():  # of members that are no arrays NumPy returns the bytes
+            if not isinstance(value, np.ndarray):
+                raise ValueError(f"{name!r} is no array")
+        return arrays
     except (FileNotFoundError, FormatError):
         raise
     except (ValueError, TypeError, OSError, EOFError, KeyError, AttributeError, MemoryError,

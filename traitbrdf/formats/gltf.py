@@ -59,7 +59,9 @@ def read_gltf(path: Path) -> list[Piece]:
     """
     document, binary = _document(path)
     try:
-        return _File(path, document, binary).pieces()
+        # `load_mesh` rejects vertices that are not finite
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return _File(path, document, binary).pieces()
     except FormatError:
         raise
     # what stands where is not checked field by field
@@ -548,8 +550,7 @@ def _cofactors(linear: Float) -> Float:
 def _placed(name: str, shape: dict[str, Any], matrix: Float) -> Piece:
     """Return a primitive placed by a transform (4, 4)."""
     linear = matrix[:3, :3]
-    with np.errstate(invalid="ignore", over="ignore"):  # `load_mesh` rejects such vertices
-        points = shape["POSITION"] @ linear.T + matrix[:3, 3]
+    points = shape["POSITION"] @ linear.T + matrix[:3, 3]
     normals = shape.get("NORMAL")
     if normals is not None:
         normals = normals @ _cofactors(linear).T

@@ -371,9 +371,9 @@ def _ply_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             case ["property", "list", length, kind, name] if elements and {length, kind} <= set(
                 _PLY_TYPES
             ):
-                _add_property(elements, _Property(name, _PLY_TYPES[kind], _PLY_TYPES[length]))
+                _add_property(path, elements, _Property(name, _PLY_TYPES[kind], _PLY_TYPES[length]))
             case ["property", kind, name] if elements and kind in _PLY_TYPES:
-                _add_property(elements, _Property(name, _PLY_TYPES[kind], ""))
+                _add_property(path, elements, _Property(name, _PLY_TYPES[kind], ""))
             case [] | ["ply"] | ["comment", *_] | ["obj_info", *_]:
                 pass
             case _:
@@ -383,8 +383,10 @@ def _ply_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     return form, elements, position
 
 
-def _add_property(elements: list[_Element], added: _Property) -> None:
+def _add_property(path: Path, elements: list[_Element], added: _Property) -> None:
     last = elements[-1]
+    if any(added.name == one.name for one in last.properties):
+        _not_ply(path, f"property {added.name!r} of {last.name!r} twice")
     elements[-1] = _Element(last.name, last.count, (*last.properties, added))
 
 
