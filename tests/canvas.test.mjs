@@ -4,9 +4,9 @@ import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import test from "node:test";
 
-const file = new URL("../traitbrdf/studio/canvas.js", import.meta.url);
+const file = new URL("../traitbrdf/studio/link.js", import.meta.url);
 const source = await readFile(file, "utf8");
-const { Link, opaque } = await import(`data:text/javascript,${encodeURIComponent(source)}`);
+const { Link, Socket, letterOf, opaque } = await import(`data:text/javascript,${encodeURIComponent(source)}`);
 
 const BRUSH = { trait: "shiny", amount: 0.5, radius: 20 };
 
@@ -42,6 +42,37 @@ test("one request is in flight, the rest is put together", () => {
   assert.deepEqual([...values.slice(-4)], [99, 0, 1, 1]);
   assert.equal(reply().newest, 99);
   assert.equal(sent.length, 2);
+});
+
+test("keys are known by their letter, or by their place on other keyboards", () => {
+  assert.equal(letterOf({ key: "z", code: "KeyW" }), "z"); // a French keyboard
+  assert.equal(letterOf({ key: "Z", code: "KeyZ" }), "z");
+  for (const [key, code, letter] of [["я", "KeyZ", "z"], ["н", "KeyY", "y"], ["ζ", "KeyZ", "z"],
+    ["ז", "KeyZ", "z"], ["и", "KeyB", "b"], ["х", "BracketLeft", "["], ["１", "Digit1", "1"]]) {
+    assert.equal(letterOf({ key, code }), letter);
+  }
+  assert.equal(letterOf({ key: "Enter", code: "Enter" }), "enter");
+  assert.equal(letterOf({ key: "é" }), "é");
+});
+
+test("a page that forbids sockets says so and goes on", async () => {
+  const old = globalThis.WebSocket;
+  globalThis.WebSocket = class {
+    constructor() {
+      throw new Error("forbidden");
+    }
+  };
+  const heard = [];
+  try {
+    const socket = new Socket("ws://127.0.0.1:1/socket", true);
+    socket.on("msg:custom", (header) => heard.push(header));
+    socket.send({ kind: "input" });
+    await new Promise((resolve) => setTimeout(resolve, 10));
+    socket.close();
+  } finally {
+    globalThis.WebSocket = old;
+  }
+  assert.deepEqual(heard, [{ kind: "closed", refused: false }]);
 });
 
 test("drags add up, sliders and choices are replaced", () => {

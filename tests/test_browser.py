@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 
@@ -88,7 +89,7 @@ class Driver:
         return np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
 
     def stroke(self, points):
-        box = self.page.locator(".tb canvas").bounding_box()
+        box = self.page.locator(".tb-stage canvas").bounding_box()
         scale = box["width"] / self.scene.width
         places = [(box["x"] + x * scale, box["y"] + y * scale) for x, y in points]
         self.page.mouse.move(*places[0])
@@ -99,7 +100,7 @@ class Driver:
 
     def pen(self, points, force):
         """A stroke of a pen that is pressed with `force`."""
-        box = self.page.locator(".tb canvas").bounding_box()
+        box = self.page.locator(".tb-stage canvas").bounding_box()
         scale = box["width"] / self.scene.width
         tools = self.page.context.new_cdp_session(self.page)
         kinds = ["mousePressed"] + ["mouseMoved"] * (len(points) - 2) + ["mouseReleased"]
@@ -112,7 +113,7 @@ class Driver:
         tools.detach()
 
     def press(self, keys):
-        self.page.locator(".tb canvas").hover()
+        self.page.locator(".tb-stage canvas").hover()
         self.page.evaluate(f"{STUDIO}.root.focus()")
         self.page.keyboard.press(keys)
 
@@ -249,7 +250,7 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         assert 0.0 < 3.0 * float(amounts[0]) < float(amounts[1])
         # a tab that is closed in the middle of a stroke leaves what it painted
         second.bring_to_front()
-        box = second.locator(".tb canvas").bounding_box()
+        box = second.locator(".tb-stage canvas").bounding_box()
         scale = box["width"] / other.scene.width
         line = along(session.edit.scene, "spout")
         second.mouse.move(box["x"] + line[0][0] * scale, box["y"] + line[0][1] * scale)
@@ -269,6 +270,190 @@ def test_the_page(page, tmp_path, training, monkeypatch):
         thread.join(30.0)
     assert not thread.is_alive()
     driver.until("document.querySelector('.tb-bad[role=alert]').textContent.includes('connection')")
+
+
+@contextlib.contextmanager
+def served(edit, folder):
+    """The session and the address of the page of an edit session."""
+    session = Session(edit, folder)
+    server = Server(session)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        yield session, server.url
+    finally:
+        server.stop()
+        thread.join(30.0)
+
+
+def small():
+    """A scene that is prepared at once."""
+    scene = tb.Scene(tb.sphere(), tb.EnvironmentMap.sky(rows=8), size=48)
+    return tb.EditSession(scene, "preview", cache=False, error=1.0)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "ratio"),
+    [(1280, 800, 1), (1440, 900, 2), (3840, 2160, 1), (800, 1200, 1), (640, 400, 2)],
+)
+def test_the_picture_is_as_large_as_the_window_allows(browser, tmp_path, width, height, ratio):
+    with served(small(), tmp_path) as (_, address):
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, device_scale_factor=ratio
+        )
+        page = context.new_page()
+        page.goto(address)
+        driver = Driver(page, None)
+        driver.settled()
+        box = page.locator(".tb-stage canvas").bounding_box()
+        side = page.locator(".tb-side").bounding_box()
+        assert box["width"] == pytest.approx(box["height"])
+        beside = side["x"] >= box["x"] + box["width"]
+        assert beside == (width > height and width > 800)
+        if beside:
+            assert box["height"] >= 0.9 * min(height, width - side["width"] - 40)
+        else:
+            assert box["width"] >= 0.9 * min(0.6 * height, width)
+        # nothing is cut, and letters grow with the window
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        letters = page.evaluate(
+            "parseFloat(getComputedStyle(document.querySelector('.tb')).fontSize)"
+        )
+        assert letters >= (22.0 if width > 3000 else 13.0)
+        context.close()
+
+
+def test_the_surround_is_neutral_and_readable(page, tmp_path):
+    channels = """(name) => {
+      const probe = document.createElement('i');
+      probe.style.color = `var(${name})`;
+      document.querySelector('.tb').append(probe);
+      return getComputedStyle(probe).color.match(/\\d+/g).map(Number);
+    }"""
+
+    def luminance(name):
+        value = np.array(page.evaluate(channels, name)[:3]) / 255.0
+        linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+        return float(linear @ (0.2126, 0.7152, 0.0722))
+
+    with served(small(), tmp_path) as (_, address):
+        page.goto(address)
+        Driver(page, None).settled()
+        for button in ("bright room", "dark room"):
+            page.get_by_role("button", name=button).click()
+            assert len(set(page.evaluate(channels, "--back")[:3])) == 1
+            for back in ("--back", "--raised"):
+                for ink in ("--text", "--quiet", "--bad"):
+                    dark, bright = sorted((luminance(back), luminance(ink)))
+                    assert (bright + 0.05) / (dark + 0.05) >= 4.5, (button, back, ink)
+
+
+def test_only_one_pointer_paints(page, tmp_path):
+    with served(small(), tmp_path) as (session, address):
+        page.goto(address)
+        driver = Driver(page, session.edit.scene)
+        driver.settled()
+        box = page.locator(".tb-stage canvas").bounding_box()
+        x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+        count = driver.state()["edits"]
+        page.mouse.move(x, y)
+        page.mouse.down(button="middle")
+        page.mouse.move(x + 40, y, steps=4)
+        page.mouse.up(button="middle")
+        fire = """([name, id, primary, x, y]) => document.querySelector("canvas").dispatchEvent(
+          new PointerEvent(name, {pointerId: id, isPrimary: primary, pointerType: 'touch',
+            button: 0, buttons: 1, clientX: x, clientY: y, bubbles: true}))"""
+        # a test's own pointers cannot be captured
+        page.evaluate("document.querySelector('.tb-stage canvas').setPointerCapture = () => {}")
+        page.evaluate(fire, ["pointerdown", 7, False, x, y])
+        assert page.evaluate(f"{STUDIO}.held ?? null") is None
+        # a second finger neither paints nor ends what the first does
+        page.evaluate(fire, ["pointerdown", 5, True, x, y])
+        page.evaluate(fire, ["pointerdown", 7, False, x, y])
+        page.evaluate(fire, ["pointerup", 7, False, x, y])
+        assert page.evaluate(f"{STUDIO}.held") == "brush"
+        # a pointer that is lost ends the stroke where it was
+        page.evaluate(fire, ["lostpointercapture", 5, True, 0, 0])
+        assert page.evaluate(f"{STUDIO}.held") is None
+        driver.edits(count + 1)
+        driver.settled()
+        assert "Stroke([(24.0, 24.0)]" in session.edit.history[-1]
+        # a Cyrillic keyboard undoes as well
+        page.evaluate("""document.dispatchEvent(new KeyboardEvent('keydown',
+          {key: '\u044f', code: 'KeyZ', ctrlKey: true, bubbles: true}))""")
+        driver.edits(count)
+
+
+def test_traits_are_in_groups_and_radius_has_keys(page, tmp_path):
+    with served(small(), tmp_path) as (session, address):
+        page.goto(address)
+        driver = Driver(page, session.edit.scene)
+        driver.settled()
+        shown = page.locator(".tb-sliders input").evaluate_all(
+            "all => all.filter(one => one.checkVisibility()).map(one => one.ariaLabel)"
+        )
+        assert shown == ["shiny", "metallic", "rough", "dusty", "bright"]
+        every = page.locator(".tb-sliders input").evaluate_all("all => all.map(x => x.ariaLabel)")
+        assert sorted(every) == sorted(session.edit.traits.names)
+        page.locator(".tb-sliders summary", has_text="made of").click()
+        assert page.locator(".tb-sliders input[aria-label=gold]").is_visible()
+        before = float(page.evaluate(f"{STUDIO}.radius.input.value"))
+        driver.press("]")
+        assert float(page.evaluate(f"{STUDIO}.radius.input.value")) > before
+        driver.press("[")
+        driver.press("[")
+        assert float(page.evaluate(f"{STUDIO}.radius.input.value")) < before
+
+
+def test_a_material_is_found_and_dropped_on_a_part(page, tmp_path):
+    scene = tb.Scene(tb.teapot(4), tb.EnvironmentMap.sky(rows=8), size=96)
+    edit = tb.EditSession(scene, "preview", cache=False, error=1.0)
+    with served(edit, tmp_path) as (session, address):
+        page.goto(address)
+        driver = Driver(page, scene)
+        driver.settled()
+        page.get_by_label("find a material").fill("old brass")  # the first action
+        first = tb.find_materials("old brass")[0]
+        shelf = page.locator(".tb-shelf button")
+        driver.until(f"document.querySelector('.tb-shelf button')?.title === '{first}'")
+        # its sphere is drawn behind: brass is yellow
+        corner = "document.querySelector('.tb-shelf canvas').getContext('2d')"
+        driver.until(f"{corner}.getImageData(20, 20, 1, 1).data[0] > 60")
+        red, _, blue, _ = page.evaluate(f"[...{corner}.getImageData(20, 20, 1, 1).data]")
+        assert red > 1.1 * blue
+        rows, columns = np.nonzero(scene.part_image == scene.parts.index("lid"))
+        box = page.locator(".tb-stage canvas").bounding_box()
+        scale = box["width"] / scene.width
+        place = {"x": float(np.median(columns)) * scale, "y": float(np.median(rows)) * scale}
+        shelf.first.drag_to(page.locator(".tb-stage canvas"), target_position=place)  # the second
+        driver.until(f"{STUDIO}.state.material === '{first}'")
+        assert session.edit.material("lid").name == first
+        assert driver.state()["part"] == "lid"
+        # what is no query is told
+        page.get_by_label("find a material").fill("shiny > high")
+        driver.until(
+            "document.querySelector('[role=alert]').textContent.includes('expected terms')"
+        )
+
+
+def test_a_design_of_another_shape_brings_its_parts(page, tmp_path):
+    other = tb.Scene(tb.teapot(4), tb.EnvironmentMap.sky(rows=8), size=32)
+    tb.EditSession(other, "preview", cache=False, error=1.0).save(tmp_path / "pot.tbr")
+    with served(small(), tmp_path) as (_, address):
+        page.goto(address)
+        driver = Driver(page, None)
+        driver.settled()
+        second = page.context.new_page()
+        second.goto(address)
+        Driver(second, None).settled()
+        page.bring_to_front()
+        page.locator(".tb input[aria-label=file]").fill("pot")
+        page.locator(".tb").get_by_role("button", name="open", exact=True).click()
+        for tab in (page, second):
+            tab.bring_to_front()
+            Driver(tab, None).until(
+                "document.querySelector('[aria-label=part]').options.length > 4"
+            )
 
 
 def test_a_wrong_token_is_told(page, tmp_path):

@@ -619,7 +619,7 @@ def test_the_page_asks_for_its_token(client):
     assert page.status_code == 200
     assert "page.js" in page.text
     assert "default-src 'self'" in page.headers["content-security-policy"]
-    for name in ("canvas.js", "page.js"):
+    for name in ("canvas.js", "link.js", "page.js"):
         module = client.get(f"/{name}")
         assert module.status_code == 200
         assert module.headers["content-type"].startswith("text/javascript")

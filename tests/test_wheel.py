@@ -25,7 +25,7 @@ edit.move("lid", shiny=0.5)
 image, error = edit.draft()
 assert image.shape == (24, 24, 3) and np.isfinite(image).all() and image.max() > 0.0
 edit.brdf("lid").write(Path(sys.argv[1]) / "lid.binary")
-assert {"canvas.js", "page.html", "page.js"} <= {
+assert {"canvas.js", "link.js", "page.html", "page.js"} <= {
     file.name for file in (Path(tb.__file__).parent / "studio").iterdir()
 }
 """

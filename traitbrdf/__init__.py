@@ -32,6 +32,7 @@ from traitbrdf.space.learning import Trait as Trait
 from traitbrdf.space.library import Library as Library
 from traitbrdf.space.library import default_embedding as default_embedding
 from traitbrdf.space.library import default_library as default_library
+from traitbrdf.space.search import find_materials as find_materials
 from traitbrdf.space.traits import TraitSpace as TraitSpace
 from traitbrdf.space.traits import default_traits as default_traits
 from traitbrdf.studio import studio as studio
@@ -60,6 +61,7 @@ __all__ = [
     "default_embedding",
     "default_library",
     "default_traits",
+    "find_materials",
     "load_mesh",
     "models",
     "reference",

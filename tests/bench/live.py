@@ -171,7 +171,7 @@ class Hand:
     def __init__(self, tab: Tab, path: np.ndarray) -> None:
         self.tab, self.path = tab, path
         self.left, self.top, self.scale = tab.evaluate(
-            "(() => { const c = document.querySelector('.tb canvas');"
+            "(() => { const c = document.querySelector('.tb-stage canvas');"
             " const b = c.getBoundingClientRect(); return [b.left, b.top, b.width / c.width]; })()"
         )
 

@@ -1,7 +1,8 @@
 """The live canvas: paint traits with the mouse, in a notebook or in a page on this machine.
 
 One `Session` (in ``session.py``, where the protocol stands) serves both; ``widget.py`` carries it
-over a notebook's kernel, ``page.py`` over a WebSocket, and ``canvas.js`` is the front end of both.
+over a notebook's kernel, ``page.py`` over a WebSocket, and ``canvas.js`` with ``link.js`` is the
+front end of both.
 """
 
 from __future__ import annotations

@@ -1,177 +1,10 @@
-// The live canvas. One plain module for notebooks (anywidget) and for the page: the protocol stands
-// in session.py. `Link` decides what is sent when and knows no page; `Canvas` is what one sees.
+// The live canvas, what one sees of it, in notebooks (anywidget) and on the page.
 
-const LOST = 20000; // ms after which a request is taken for lost
-const CROWD = 8192; // samples of one request, beyond which every other one is left out
-const SLOW = 30; // ms of a round trip that no work explains
+import { Link, Socket, letterOf, opaque } from "./link.js";
+
 const RESTS = 250; // ms until the hand rests
 const OTHERS = 100; // ms between two looks at what other views changed
 const TELLS = 120; // ms between two looks of the hand's owner at figures and sliders
-
-const sameKeys = (a, b) => JSON.stringify(Object.keys(a)) === JSON.stringify(Object.keys(b));
-
-/** One request in flight; what happens meanwhile is put together into the next. */
-export class Link {
-  constructor(view, send, {
-    now = () => performance.now(), later = (act, ms) => setTimeout(act, ms), padding = true,
-    greeting = {},
-  } = {}) {
-    Object.assign(this, { view, send, now, later, padding, greeting });
-    this.queue = []; // of requests that cannot be put together
-    this.flying = null;
-    this.seq = 0;
-    this.slow = 0;
-    this.pad = false;
-  }
-
-  /** Ask for something; `join` says that it may become one with what waits. */
-  ask(header, join = true) {
-    const last = this.queue[this.queue.length - 1];
-    if (join && last && this.#fits(last.header, header)) {
-      for (const [key, value] of Object.entries(header)) {
-        if (key === "orbit") last.header.orbit = last.header.orbit
-          ? [last.header.orbit[0] + value[0], last.header.orbit[1] + value[1]] : value;
-        else if (key === "turn") last.header.turn = (last.header.turn ?? 0) + value;
-        else if (key === "zoom") last.header.zoom = (last.header.zoom ?? 1) * value;
-        else last.header[key] = value;
-      }
-    } else this.queue.push({ header: { ...header }, samples: [], newest: null });
-    this.pump();
-  }
-
-  #fits(old, fresh) {
-    // a stroke, a slider and a command are obeyed one after the other
-    const kinds = ["brush", "slide", "layer", "assign", "do", "save", "open", "pick", "hello"];
-    const had = kinds.filter((kind) => kind in old);
-    const has = kinds.filter((kind) => kind in fresh);
-    if (!had.length || !has.length) return !("hello" in old || "hello" in fresh);
-    if (had.length > 1 || had[0] !== has[0]) return false;
-    if (had[0] === "brush") return JSON.stringify(old.brush) === JSON.stringify(fresh.brush);
-    if (had[0] === "layer") {
-      return "set" in old.layer && "set" in fresh.layer && !old.layer.done
-        && old.layer.index === fresh.layer.index && sameKeys(old.layer.set, fresh.layer.set);
-    }
-    return had[0] === "slide" && !old.slide.done && old.slide.part === fresh.slide.part
-      && sameKeys(old.slide.amounts, fresh.slide.amounts);
-  }
-
-  /** Samples [x, y, pressure, phase, time] of the brush. */
-  paint(brush, samples) {
-    this.#hold = true;
-    this.ask({ brush });
-    this.#hold = false;
-    const last = this.queue[this.queue.length - 1];
-    for (const [x, y, pressure, phase, time] of samples) {
-      last.samples.push(x, y, pressure, phase);
-      last.newest = time ?? this.now();
-    }
-    if (last.samples.length > 4 * CROWD) {
-      const kept = [];
-      for (let i = 0; i < last.samples.length; i += 4) {
-        const moved = last.samples[i + 3] === 1;
-        if (!moved || (i / 4) % 2) kept.push(...last.samples.slice(i, i + 4));
-      }
-      last.samples = kept;
-    }
-    this.pump();
-  }
-
-  #hold = false;
-
-  pump() {
-    if (this.flying || this.#hold || !this.queue.length) return;
-    const { header, samples, newest } = this.queue.shift();
-    const seq = ++this.seq;
-    this.flying = { seq, sent: this.now(), newest };
-    const kind = "hello" in header ? "hello" : "input";
-    const message = { kind, view: this.view, seq, ...header };
-    delete message.hello;
-    if (this.pad) message.pad = true;
-    if (kind === "hello") Object.assign(message, this.greeting);
-    this.later(() => {
-      if (this.flying?.seq === seq) this.renew();
-    }, LOST);
-    this.send(message, samples.length ? [new Float32Array(samples).buffer] : []);
-  }
-
-  /** Take the reply to the request in flight; its times, or null if it is the reply to another. */
-  answered(header) {
-    const flown = this.flying;
-    if (!flown || header.seq !== flown.seq) return null;
-    this.flying = null;
-    const trip = this.now() - flown.sent;
-    const work = Object.values(header.ms ?? {}).reduce((a, b) => a + b, 0);
-    this.slow = header.ms && trip - work > SLOW ? this.slow + 1 : 0;
-    this.pad ||= this.padding && this.slow >= 4;
-    this.pump();
-    return { trip, work, newest: flown.newest };
-  }
-
-  /** Begin anew: the other side may have forgotten, or be another. */
-  renew() {
-    this.flying = null;
-    this.queue = this.queue.filter(({ header }) => !("hello" in header));
-    this.queue.unshift({ header: { hello: true }, samples: [], newest: null });
-    this.pump();
-  }
-}
-
-const encoder = new TextEncoder();
-const decoder = new TextDecoder();
-
-/** What a notebook's widget manager does for the canvas, over one WebSocket (see page.py). */
-export class Socket {
-  constructor(address, lasting) {
-    Object.assign(this, { address, lasting });
-    this.listeners = new Set();
-    this.open();
-  }
-
-  open() {
-    this.socket = new WebSocket(this.address);
-    this.socket.binaryType = "arraybuffer";
-    this.socket.onmessage = ({ data }) => {
-      const length = new DataView(data).getUint32(0, true);
-      const header = JSON.parse(decoder.decode(new Uint8Array(data, 4, length)));
-      const rest = data.byteLength - 4 - length;
-      this.tell(header, rest ? [new DataView(data, 4 + length, rest)] : []);
-    };
-    this.socket.onopen = () => this.tell({ kind: "open" }, []);
-    this.socket.onclose = ({ code }) => {
-      this.tell({ kind: "closed", refused: code === 4403 || code === 1006 && !this.greeted }, []);
-      if (this.greeted && this.lasting) setTimeout(() => this.open(), 1000);
-    };
-  }
-
-  tell(header, buffers) {
-    if (header.kind === "frame") this.greeted = true;
-    for (const listener of this.listeners) listener(header, buffers);
-  }
-
-  on(name, listener) {
-    if (name === "msg:custom") this.listeners.add(listener);
-  }
-
-  off(name, listener) {
-    this.listeners.delete(listener);
-  }
-
-  send(header, callbacks, buffers = []) {
-    if (this.socket.readyState !== WebSocket.OPEN) return;
-    const head = encoder.encode(JSON.stringify(header));
-    const body = buffers.length ? new Uint8Array(buffers[0]) : new Uint8Array(0);
-    const message = new Uint8Array(4 + head.length + body.length);
-    new DataView(message.buffer).setUint32(0, head.length, true);
-    message.set(head, 4);
-    message.set(body, 4 + head.length);
-    this.socket.send(message);
-  }
-
-  close() {
-    this.lasting = false;
-    this.socket.close();
-  }
-}
 
 /** An image of the bytes of a file. Blobs are registered with the browser's own process, which takes
  * milliseconds: where there are decoders, they are spared. */
@@ -183,21 +16,14 @@ async function decoded(data, type) {
   return image;
 }
 
-/** RGBA bytes of RGB ones. */
-export function opaque(rgb) {
-  const out = new Uint8ClampedArray((rgb.length / 3) * 4);
-  for (let i = 0, k = 0; i < rgb.length; i += 3, k += 4) {
-    out[k] = rgb[i];
-    out[k + 1] = rgb[i + 1];
-    out[k + 2] = rgb[i + 2];
-    out[k + 3] = 255;
-  }
-  return out;
-}
-
 const STYLE = `
-.tb { display: flex; flex-wrap: wrap; gap: 16px; color: #ddd; background: #1d1f22; padding: 12px;
-  font: 13px/1.4 system-ui, sans-serif; outline: none; border-radius: 6px; contain: content; }
+.tb { --back: #1e1e1e; --raised: #2c2c2c; --line: #4c4c4c; --text: #e4e4e4; --quiet: #a6a6a6;
+  --accent: #6aa0dc; --on: #34608f; --bad: #ff9d7a; color-scheme: dark;
+  display: flex; flex-wrap: wrap; gap: 16px; color: var(--text); background: var(--back);
+  padding: 12px; font: 13px/1.4 system-ui, sans-serif; outline: none; border-radius: 6px;
+  contain: content; box-sizing: border-box; }
+.tb[data-theme=light] { --back: #d2d2d2; --raised: #ededed; --line: #8a8a8a; --text: #1a1a1a;
+  --quiet: #474747; --accent: #1d5c9c; --on: #a9c6e6; --bad: #8c2600; color-scheme: light; }
 .tb-stage { position: relative; contain: layout paint; line-height: 0; align-self: flex-start; touch-action: none; }
 .tb-stage canvas { max-width: 100%; background: #000; cursor: none; border-radius: 4px; }
 .tb-stage[data-tool=pick] canvas { cursor: pointer; }
@@ -206,29 +32,47 @@ const STYLE = `
   outline: 1px solid #0008; display: none; left: 0; top: 0; box-sizing: border-box;
   will-change: transform; }
 .tb-stage[data-tool=brush]:hover .tb-ring { display: block; }
-.tb-side { width: 290px; display: flex; flex-direction: column; gap: 8px; }
-.tb-row { display: flex; gap: 6px; align-items: center; }
-.tb-row > label { width: 62px; color: #9aa0a6; }
+.tb-side { width: 22em; display: flex; flex-direction: column; gap: 0.6em; }
+.tb-whole { display: grid; grid-template-columns: minmax(0, 1fr) auto; width: 100%; height: 100vh;
+  border-radius: 0; font-size: clamp(13px, 0.45vw + 0.45vh + 4px, 24px); }
+.tb-whole .tb-stage { place-self: center;
+  width: min(100%, calc((100vh - 24px) * var(--aspect, 1))); }
+.tb-whole .tb-stage canvas { width: 100%; height: auto; }
+.tb-whole .tb-side { overflow-y: auto; min-height: 0; padding-right: 4px; }
+@media (max-aspect-ratio: 1/1), (max-width: 800px) {
+  .tb-whole { grid-template-columns: minmax(0, 1fr); height: auto; min-height: 100vh; }
+  .tb-whole .tb-stage { width: min(100%, calc(60vh * var(--aspect, 1))); }
+  .tb-whole .tb-side { width: auto; }
+}
+.tb-row { display: flex; gap: 0.5em; align-items: center; }
+.tb-row > label { width: 5em; color: var(--quiet); }
 .tb-row > select, .tb-row > input { flex: 1; min-width: 0; }
-.tb output { width: 40px; text-align: right; font-variant-numeric: tabular-nums; }
-.tb button, .tb select, .tb input[type=text] { background: #2b2e33; color: #eee;
-  border: 1px solid #4a4e55; border-radius: 4px; padding: 3px 8px; font: inherit; }
-.tb button[aria-pressed=true] { background: #3b6ea5; border-color: #6aa0dc; }
+.tb output { width: 3em; text-align: right; font-variant-numeric: tabular-nums; }
+.tb button, .tb select, .tb input[type=text] { background: var(--raised); color: var(--text);
+  border: 1px solid var(--line); border-radius: 4px; padding: 0.25em 0.6em; font: inherit; }
+.tb :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
+.tb button[aria-pressed=true] { background: var(--on); border-color: var(--accent); }
 .tb button:disabled { opacity: 0.4; }
-.tb input[type=range] { accent-color: #6aa0dc; }
-.tb-sliders { max-height: 230px; overflow-y: auto; border-top: 1px solid #3a3d42;
-  border-bottom: 1px solid #3a3d42; padding: 4px 2px; }
-.tb-layers { max-height: 150px; overflow-y: auto; border-top: 1px solid #3a3d42; }
-.tb-layer { display: flex; gap: 4px; align-items: center; padding: 2px; cursor: default; }
-.tb-layer[aria-selected=true] { background: #2d435c; }
+.tb input[type=range], .tb input[type=checkbox] { accent-color: var(--accent); }
+.tb-sliders { border-top: 1px solid var(--line); border-bottom: 1px solid var(--line);
+  padding: 0.3em 0.1em; }
+.tb-sliders summary { cursor: pointer; color: var(--quiet); padding: 0.15em 0; }
+.tb-shelf { display: grid; grid-template-columns: repeat(auto-fill, minmax(2.9em, 1fr)); gap: 3px;
+  max-height: 9.5em; overflow-y: auto; flex-shrink: 0; }
+.tb-shelf button { padding: 1px; line-height: 0; }
+.tb-shelf canvas { width: 100%; height: auto; border-radius: 50%; }
+.tb-layers { max-height: 12em; overflow-y: auto; border-top: 1px solid var(--line); flex-shrink: 0; }
+.tb-layer { display: flex; gap: 0.3em; align-items: center; padding: 2px; cursor: default; }
+.tb-layer[aria-selected=true] { background: var(--on); }
 .tb-layer > span { flex: 1; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
-.tb-layer > input[type=range] { width: 64px; }
+.tb-layer > input[type=range] { width: 5em; }
 .tb-side[data-where=part] .tb-soft { display: none; }
-.tb-status { font-variant-numeric: tabular-nums; color: #b7bcc2; min-height: 3.9em; }
-.tb-status b { color: #fff; font-weight: 600; }
-.tb-bad { color: #ff9d7a; }
-.tb pre { margin: 0; font: 11px/1.35 ui-monospace, monospace; color: #9fc3e8; white-space: pre-wrap;
-  overflow-wrap: anywhere; max-height: 9em; overflow-y: auto; background: none; }
+.tb-status { font-variant-numeric: tabular-nums; color: var(--quiet); min-height: 3.9em; }
+.tb-status b { color: var(--text); font-weight: 600; }
+.tb-bad { color: var(--bad); }
+.tb pre { margin: 0; font: 0.85em/1.35 ui-monospace, monospace; color: var(--text);
+  white-space: pre-wrap; overflow-wrap: anywhere; max-height: 9em; overflow-y: auto;
+  background: none; flex-shrink: 0; }
 `;
 
 function make(tag, properties = {}, ...children) {
@@ -329,11 +173,18 @@ class Canvas {
     this.exact = make("button", { textContent: "exact", disabled: true,
       title: "render without the basis what it cannot promise: takes seconds",
       onclick: () => this.link.ask({ exact: true, rest: true }, false) });
+    this.theme = make("button", { title: "what is around the picture",
+      onclick: () => this.surround(this.root.dataset.theme === "light" ? "dark" : "light") });
+    this.wide = make("button", { textContent: "full screen", title: "F: full screen, and back",
+      onclick: () => this.enlarge() });
     this.name = make("input", { type: "text", value: "design", size: 10, ariaLabel: "file" });
     const save = make("button", { textContent: "save",
       onclick: () => this.change({ save: this.name.value }, false) });
     const open = make("button", { textContent: "open",
       onclick: () => this.change({ open: this.name.value }, false) });
+    this.query = make("input", { type: "text", ariaLabel: "find a material",
+      placeholder: "old brass, shiny < .7", oninput: () => this.find() });
+    this.shelf = make("div", { className: "tb-shelf", role: "group", ariaLabel: "materials" });
     this.sliders = make("div", { className: "tb-sliders" });
     this.status = make("div", { className: "tb-status", role: "status" });
     this.said = make("div", { className: "tb-bad", role: "alert" });
@@ -347,6 +198,7 @@ class Canvas {
     const side = this.side = make("div", { className: "tb-side" },
       row(...Object.values(this.tools)),
       named("part", this.parts), named("material", this.library),
+      named("find", this.query), this.shelf,
       named("paint", this.where), soft(named("with", this.paintWith, this.colour)),
       this.traitRow = named("trait", this.trait),
       this.materialRow = soft(named("paint with", this.paintMaterial)),
@@ -357,13 +209,17 @@ class Canvas {
       make("label", { title: "a stroke paints only the part on which it begins" },
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
+      row(this.theme, this.wide),
       this.layers, make("div", { className: "tb-row", style: "flex-wrap: wrap" }, ...this.tied),
       this.sliders, this.status, this.said, this.history);
     this.choose();
-    this.root = make("div", { className: "tb", tabIndex: 0 },
+    this.fills = fill;
+    this.root = make("div", { className: fill ? "tb tb-whole" : "tb", tabIndex: 0 },
       make("style", { textContent: STYLE }), this.stage, side);
     el.append(this.root);
     this.root.studio = this;
+    this.surround(globalThis.matchMedia?.("(prefers-color-scheme: light)").matches && !fill
+      ? "light" : "dark");
     this.take("brush");
     this.listen(fill ? document : this.root);
   }
@@ -376,6 +232,18 @@ class Canvas {
     return { input, output };
   }
 
+  /** A light or a dark surround; both are neutral, so that colours are judged well. */
+  surround(theme) {
+    this.root.dataset.theme = theme;
+    this.theme.textContent = theme === "light" ? "dark room" : "bright room";
+  }
+
+  /** Full screen, and back. */
+  enlarge() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.root.requestFullscreen?.().catch((error) => { this.said.textContent = `${error}`; });
+  }
+
   /** Show the controls of what a stroke does. */
   choose() {
     const local = this.where.value === "local";
@@ -385,6 +253,36 @@ class Canvas {
     this.materialRow.hidden = way !== "material";
     this.colour.hidden = way !== "colour";
     for (const line of [this.traitRow, this.materialRow]) line.style.display = line.hidden ? "none" : "";
+  }
+
+  /** Look for materials, once the typing rests. */
+  find() {
+    clearTimeout(this.finding);
+    this.finding = setTimeout(() => this.link.ask({ shelf: { query: this.query.value } }, false),
+      RESTS);
+  }
+
+  /** Show the materials that were found: a click assigns one, and so does dropping it on a part. */
+  async stock({ names, total, side, query }, buffer) {
+    if (query !== this.query.value) return;
+    const key = JSON.stringify(names);
+    if (key !== this.stocked) {
+      this.stocked = key;
+      this.shelf.replaceChildren(...names.map((name) => make("button", { title: name,
+        ariaLabel: name, draggable: true,
+        onclick: () => this.change({ assign: { part: this.state.part, material: name } }, false),
+        ondragstart: (event) => event.dataTransfer.setData("text/plain", name),
+      }, make("canvas", { width: side, height: side }))));
+    }
+    this.shelf.title = total > names.length ? `the first ${names.length} of ${total}` : "";
+    if (!buffer) return;
+    const bytes = new Uint8Array(buffer.buffer ?? buffer, buffer.byteOffset ?? 0);
+    const strip = await decoded(bytes, "image/jpeg");
+    if (key !== this.stocked) return;
+    [...this.shelf.children].forEach((button, i) => {
+      button.firstChild.getContext("2d").drawImage(strip, side * i, 0, side, side, 0, 0, side, side);
+    });
+    strip.close();
   }
 
   /** Do something to the chosen layer. */
@@ -460,9 +358,21 @@ class Canvas {
     // where it can be had, the pen is heard at once: "pointermove" waits for the next picture
     this.raw = "onpointerrawupdate" in this.picture;
     if (this.raw) on(this.picture, "pointerrawupdate", (event) => this.stroke(event));
-    for (const name of ["pointerup", "pointercancel"]) {
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
       on(this.picture, name, (event) => this.up(event));
     }
+    on(document, "fullscreenchange", () => {
+      const whole = this.fills || document.fullscreenElement === this.root;
+      this.root.classList.toggle("tb-whole", whole);
+    });
+    on(this.picture, "dragover", (event) => event.preventDefault());
+    on(this.picture, "drop", (event) => {
+      event.preventDefault();
+      const material = event.dataTransfer.getData("text/plain");
+      if (!material) return;
+      this.change({ pick: this.place(event) }, false);
+      this.change({ assign: { material } }, false); // of the part that was picked
+    });
     on(this.picture, "wheel", (event) => {
       event.preventDefault();
       this.drag({ zoom: Math.exp(-0.001 * event.deltaY) });
@@ -473,7 +383,7 @@ class Canvas {
   }
 
   key(event) {
-    const letter = event.key.toLowerCase();
+    const letter = letterOf(event);
     const typing = event.target instanceof HTMLInputElement && event.target.type === "text";
     if (typing) {
       event.stopPropagation();
@@ -485,6 +395,9 @@ class Canvas {
     } else if ((event.ctrlKey || event.metaKey) && letter === "y") {
       act = () => this.change({ do: "redo" }, false);
     } else if (event.ctrlKey || event.metaKey || event.altKey) return;
+    else if (letter === "[" || letter === "]") {
+      act = () => this.resize(letter === "]" ? 1.15 : 1 / 1.15);
+    } else if (letter === "f" && !event.repeat) act = () => this.enlarge();
     else if (letter === "b" && !event.repeat) act = () => this.showBefore(!this.before);
     else if ("1234".includes(letter)) act = () => this.take(Object.keys(TOOLS)[letter - 1]);
     if (act) {
@@ -520,10 +433,21 @@ class Canvas {
     return brush;
   }
 
+  /** A wider or narrower brush. */
+  resize(factor) {
+    const { input, output } = this.radius;
+    const value = Math.round(input.value * factor) + (factor > 1 ? 1 : -1) * (input.value < 8);
+    input.value = Math.min(Math.max(value, input.min), input.max);
+    output.textContent = input.value;
+    if (this.at) this.moveRing(this.at);
+  }
+
   down(event) {
     this.root.focus({ preventScroll: true });
+    // neither a second finger nor the middle button paints
+    if (this.held || !this.state || !event.isPrimary || ![0, 2].includes(event.button)) return;
     this.picture.setPointerCapture(event.pointerId);
-    if (this.held || !this.state) return;
+    this.pointer = event.pointerId;
     const turning = event.button === 2 || this.tool === "orbit";
     this.held = turning ? "orbit" : this.tool;
     this.from = [event.clientX, event.clientY];
@@ -531,11 +455,13 @@ class Canvas {
     if (this.before) this.showBefore(false);
     if (this.held === "brush") {
       this.pressure = event.pointerType === "pen" ? event.pressure : 1;
-      this.paint([this.sample(event, 0)]);
+      this.newest = this.sample(event, 0);
+      this.paint([this.newest]);
     } else if (this.held === "pick") this.change({ pick: this.place(event) });
   }
 
   move(event) {
+    if (this.held && event.pointerId !== this.pointer) return;
     this.moveRing(event);
     if (this.held === "brush") {
       if (!this.raw) this.stroke(event);
@@ -548,15 +474,20 @@ class Canvas {
   }
 
   stroke(event) {
-    if (this.held !== "brush") return;
+    if (this.held !== "brush" || event.pointerId !== this.pointer) return;
     const all = event.getCoalescedEvents?.() ?? [];
     this.pressure = event.pointerType === "pen" ? event.pressure : 1;
-    this.paint((all.length ? all : [event]).map((one) => this.sample(one, 1)));
+    const samples = (all.length ? all : [event]).map((one) => this.sample(one, 1));
+    this.newest = samples[samples.length - 1];
+    this.paint(samples);
   }
 
   up(event) {
+    if (!this.held || event.pointerId !== this.pointer) return;
     if (this.held === "brush") {
-      const last = this.sample(event, 2);
+      // a pointer that was lost, or taken for a gesture, has no place of its own
+      const last = event.type === "pointerup" ? this.sample(event, 2) : [...this.newest];
+      last[3] = 2;
       last[2] = this.pressure; // a pen that is lifted presses no more
       this.paint([last]);
     } else if (this.held === "orbit" || this.held === "light") this.drop();
@@ -564,6 +495,7 @@ class Canvas {
   }
 
   moveRing(event) {
+    this.at = { clientX: event.clientX, clientY: event.clientY };
     // while the pen is down nothing moves the picture: asking where it is lays the page out
     const box = this.held ? this.box : this.picture.getBoundingClientRect();
     const radius = (this.radius.input.value * box.width) / this.picture.width;
@@ -631,6 +563,7 @@ class Canvas {
         ? "refused: open the address that the command printed" : "connection lost: trying again";
     } else if (header.kind === "changed") this.others(header);
     else if (header.view !== this.view) return;
+    else if (header.kind === "shelf") this.stock(header, buffers[0]);
     else if (header.kind === "error") {
       this.said.textContent = header.message;
       if (header.seq !== null) this.link.answered(header);
@@ -680,6 +613,7 @@ class Canvas {
       header.bytes);
     if (this.picture.width !== header.width || this.picture.height !== header.height) {
       Object.assign(this.picture, { width: header.width, height: header.height });
+      this.root.style.setProperty("--aspect", header.width / header.height);
     }
     if (format === "rgb") {
       this.paper.putImageData(new ImageData(opaque(bytes), w, h), x, y);
@@ -704,7 +638,7 @@ class Canvas {
     this.update(header.state);
   }
 
-  fill({ parts, traits, library }) {
+  fill({ parts, traits, library, groups }) {
     const options = (select, names) => {
       const old = select.value;
       select.replaceChildren(...names.map((name) => make("option", { value: name,
@@ -715,6 +649,7 @@ class Canvas {
     options(this.library, ["", ...library]);
     options(this.paintMaterial, library);
     options(this.trait, traits);
+    if (!this.chosen) this.find();
     if (!this.chosen && traits.includes("shiny")) this.trait.value = "shiny";
     this.chosen = true;
     this.scores = Object.fromEntries(traits.map((trait) => {
@@ -729,8 +664,10 @@ class Canvas {
       });
       return [trait, slider];
     }));
-    this.sliders.replaceChildren(...traits.map((trait) => make("div", { className: "tb-row" },
-      make("label", { textContent: trait }), this.scores[trait].input, this.scores[trait].output)));
+    const line = (trait) => make("div", { className: "tb-row" },
+      make("label", { textContent: trait }), this.scores[trait].input, this.scores[trait].output);
+    this.sliders.replaceChildren(...groups.map(([title, names], i) => make("details",
+      { open: i === 0 }, make("summary", { textContent: title }), ...names.map(line))));
   }
 
   update(state) {

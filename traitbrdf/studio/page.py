@@ -157,6 +157,7 @@ def application(session: Session, token: str, origins: Set[str]) -> Starlette:
         routes=[
             Route("/", page),
             Route("/canvas.js", module),
+            Route("/link.js", module),
             Route("/page.js", module),
             WebSocketRoute("/socket", channel),
         ],

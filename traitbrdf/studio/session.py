@@ -27,6 +27,8 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
       ``dragging`` says that more of these follow at once: they get glances, and preparation waits
       for the end of the drag
+    - ``shelf`` {query}: the library materials that a query describes (`find_materials`); the
+      ``shelf`` message below is the answer. ``assign`` without a part means the chosen one
     - ``do``: "undo", "redo"
     - ``save``, ``open``: names of design files in the session's folder
     - ``before``: show the frame without any layer
@@ -41,10 +43,14 @@ Down (session to page)
 "bytes", ...}`` with the pixels that changed: the first ``bytes`` of the buffer
     ``format`` is "jpeg", "png", "rgb" (3 bytes a pixel) or "none" (nothing changed). ``ms`` are
     milliseconds spent on "edit", "render" and "encode". ``state`` has the chosen part and what can
-    be done: see `Session._state`. The reply to a hello also has ``parts``, ``traits`` and
-    ``library``.
+    be done: see `Session._state`. The reply to a hello also has ``parts``, ``traits``, ``library``
+    and ``groups`` [title, traits] of the traits, the few that matter first; so has the next reply
+    to a view when they change, because a design of another shape was opened.
 ``{"kind": "error", "view", "seq", "message"}``
     The request was not obeyed, or only in part. The session goes on.
+``{"kind": "shelf", "view", "query", "names", "total", "side"}``
+    The first materials of ``total`` that a query describes, and in the buffer a JPEG of their
+    spheres side by side. It comes once more when spheres that were not drawn yet are.
 ``{"kind": "changed", "by", "ready", "fraction"}``
     Pushed to subscribers, at most ten times a second: a view (``by``; "" is several) or the
     preparation changed the picture. Other views ask for it by an empty input when they want it.
@@ -52,8 +58,10 @@ Down (session to page)
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -75,7 +83,9 @@ from traitbrdf.formats.display import Display, exposure_of
 from traitbrdf.formats.files import unknown_name
 from traitbrdf.scene.camera import Camera
 from traitbrdf.session.editing import EditSession
+from traitbrdf.space.search import find_materials
 from traitbrdf.space.traits import default_traits
+from traitbrdf.studio.shelf import SIDE, Shelf
 
 Header = dict[str, Any]
 Reply = tuple[Header, list[bytes]]
@@ -85,6 +95,10 @@ LARGEST = 1 << 20
 """Size of the largest message that is accepted, in bytes."""
 _RAW = 200_000
 """A rectangle of at most this many bytes is sent as it is, since encoding takes longer."""
+_SHELF = 24
+"""Materials of one answer to a query."""
+_AT_ONCE = 6
+"""Spheres that are drawn before a view is told."""
 _VIEWS = 32
 """Number of views whose last frame is remembered."""
 _SPACING = 0.03
@@ -95,6 +109,14 @@ _POINTS = 4096
 _NEWS = 0.1
 """Seconds for which changes are collected before views are told."""
 _PADDED = 66_000
+_GROUPS: dict[str, tuple[str, ...]] = {
+    "look": ("shiny", "metallic", "rough", "dusty", "bright"),
+    "highlight": ("glossy", "matte", "strength", "sharpness", "tint", "specular"),
+    "touch": ("soft", "hard", "greasy", "diffuse"),
+    "made of": ("silver", "gold", "plastic", "acrylic", "ceramic", "rubber", "fabric"),
+    "colour": ("red", "green", "blue"),
+}
+"""What traits are about; the first group is the one that is needed most."""
 _SETTINGS = {"opacity", "visible", "name"}
 """Settings of layers that a page may change."""
 _CHANGES = {
@@ -174,11 +196,15 @@ class Session:
         self, edit: EditSession, folder: str | Path | None = None, quality: int = 90
     ) -> None:
         self.edit = edit
-        self.folder = Path.cwd() if folder is None else Path(folder)
+        self.folder = _here() if folder is None else Path(folder)
         self.quality = quality
         self._lock = threading.RLock()
         self.subscribers: dict[object, Push] = {}
         self._sent: dict[str, NDArray[np.float32]] = {}
+        self._shelf = Shelf(edit.library)
+        self._drawing = threading.Lock()
+        self._wanted: dict[str, tuple[str, list[str], int]] = {}
+        self._listed: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
         self._stroke: Stroke | None = None
         self._strength = (0.0, 0.0, 0)  # pixels travelled, sum of pressures, samples
         self._local: _Local | None = None
@@ -301,10 +327,16 @@ class Session:
             "render": round(1e3 * (rendered - edited), 2),
             "encode": round(1e3 * (done - rendered), 2),
         }
-        if kind == "hello":
+        listed = edit.scene.parts, edit.traits.names
+        if kind == "hello" or self._listed.get(view, listed) != listed:
             reply["parts"] = list(edit.scene.parts)
             reply["traits"] = list(edit.traits.names)
+            reply["groups"] = _grouped(edit.traits.names)
             reply["library"] = list(edit.library.names)
+            self._listed.pop(view, None)
+            self._listed[view] = listed
+            while len(self._listed) > _VIEWS:
+                self._listed.pop(next(iter(self._listed)))
         self._dragging = dragging
         # what is prepared, or made exact, is shown when it is there: nobody waits
         if not self._dragging and (not ready or (rest and edit.unfinished)):
@@ -315,6 +347,10 @@ class Session:
         if header.get("pad") is True:
             pixels += bytes(max(0, _PADDED - len(pixels)))
         replies: list[Reply] = [(reply, [pixels] if pixels else [])]
+        if "shelf" in header and view in self._wanted:
+            replies.append(self._shelf_of(view))
+            if self._shelf.missing(self._wanted[view][1]):
+                threading.Thread(target=self._draw_shelf, daemon=True).start()
         if trouble:
             replies.insert(
                 0, ({"kind": "error", "view": view, "seq": None, "message": trouble}, [])
@@ -331,6 +367,7 @@ class Session:
             ("slide", lambda slide: self._slide(view, slide)),
             ("layer", lambda layer: self._layer(view, layer)),
             ("assign", self._assign),
+            ("shelf", lambda shelf: self._browse(view, shelf)),
             ("orbit", lambda _: self._look(header)),
             ("zoom", lambda _: None if "orbit" in header else self._look(header)),
             ("turn", self._turn),
@@ -523,7 +560,39 @@ class Session:
     def _assign(self, assign: object) -> None:
         if not isinstance(assign, Mapping):
             raise TypeError(f"expected an object, got {assign!r}")
-        self.edit.assign(str(assign.get("part")), str(assign.get("material")))
+        part = assign.get("part")
+        self.edit.assign(self._part if part is None else str(part), str(assign.get("material")))
+
+    def _browse(self, view: str, shelf: object) -> None:
+        """Look for library materials; `_show_shelf` answers."""
+        query = shelf.get("query") if isinstance(shelf, Mapping) else None
+        if not isinstance(query, str) or len(query) > 200:
+            raise ValueError(f"expected a query of up to 200 letters, got {query!r}")
+        names = find_materials(query, self.edit.library, self.edit.traits)
+        self._wanted[view] = query, names[:_SHELF], len(names)
+
+    def _shelf_of(self, view: str) -> Reply:
+        query, names, total = self._wanted[view]
+        told = {
+            "kind": "shelf", "view": view, "query": query, "names": names, "total": total,
+            "side": SIDE,
+        }  # fmt: skip
+        return told, [self._shelf.strip(names)] if names else []
+
+    def _draw_shelf(self) -> None:
+        """Draw the spheres that views wait for, a few at a time, and tell of them."""
+        with self._drawing:
+            while not self._closed:
+                waiting = [(view, self._shelf.missing(w[1])) for view, w in self._wanted.items()]
+                view, names = next(((v, n) for v, n in waiting if n), ("", []))
+                if not names:
+                    return
+                self._shelf.draw(names[:_AT_ONCE])
+                with self._lock:
+                    pushes, news = list(self.subscribers.values()), self._shelf_of(view)
+                for push in pushes:
+                    with contextlib.suppress(Exception):  # the view is gone
+                        push(dict(news[0]), list(news[1]))
 
     def _look(self, header: Mapping[str, Any]) -> None:
         camera = self.edit.scene.camera
@@ -720,6 +789,22 @@ class Session:
                     return
 
 
+def _here() -> Path:
+    """Return the working directory; one that was deleted is told of when a file is saved there."""
+    try:
+        return Path.cwd()
+    except FileNotFoundError:
+        return Path()
+
+
+def _grouped(names: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Return titles and traits of the groups, those that no group knows last."""
+    known = {name for group in _GROUPS.values() for name in group}
+    groups = [(title, [n for n in group if n in names]) for title, group in _GROUPS.items()]
+    groups.append(("yours", [name for name in names if name not in known]))
+    return [(title, group) for title, group in groups if group]
+
+
 def _layer_told(layer: Layer) -> Header:
     """Return what a list of layers shows of one."""
     return {
@@ -730,7 +815,11 @@ def _layer_told(layer: Layer) -> Header:
 
 
 def _shortened(line: str) -> str:
-    """Shorten a line of the history: long strokes are told by their number of points."""
+    """Shorten a line of the history: long strokes are told by their number of points.
+
+    Numbers are rounded to four digits.
+    """
+    line = re.sub(r"\d+\.\d{5,}(e[-+]?\d+)?", lambda found: f"{float(found[0]):.4g}", line)
     start, _, rest = line.partition("Stroke([")
     points, close, end = rest.partition("], trait=")
     if not close or points.count("(") <= 2:

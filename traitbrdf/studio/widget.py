@@ -18,6 +18,14 @@ from traitbrdf.session.editing import EditSession
 from traitbrdf.studio.page import Server
 from traitbrdf.studio.session import Session
 
+_FILES = ("link.js", "canvas.js")
+
+
+def _module() -> str:
+    """Return the front end as one module: notebooks load no second one beside it."""
+    link, canvas = (Path(__file__).with_name(name).read_text("utf-8") for name in _FILES)
+    return link + "".join(line for line in canvas.splitlines(True) if '"./link.js"' not in line)
+
 
 class Canvas(anywidget.AnyWidget):
     """The widget that `traitbrdf.studio` shows; all views of it share one `Session`.
@@ -35,7 +43,7 @@ class Canvas(anywidget.AnyWidget):
         Gives pages on this machine a socket, once one has asked for it.
     """
 
-    _esm = Path(__file__).with_name("canvas.js")
+    _esm = _module()
 
     def __init__(self, edit: EditSession, **settings: Any) -> None:
         super().__init__(**settings)
