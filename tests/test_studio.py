@@ -606,6 +606,90 @@ def test_a_display_shows_what_the_tone_map_does():
 HOME = "http://127.0.0.1:80"
 
 
+# -- materials to choose from, and lists ----------------------------------------------------------
+
+
+def test_a_shelf_is_told_at_once_and_drawn_behind(session):
+    pushed = []
+    session.subscribe(lambda header, buffers: pushed.append((header, buffers)))
+    replies = ask(session, shelf={"query": "old brass"})
+    (told,) = (header for header, _ in replies if header["kind"] == "shelf")
+    found = tb.find_materials("old brass")
+    assert told["names"] == found[:24]
+    assert told["total"] == len(found)
+    shelves: list = []
+    deadline = time.monotonic() + 60.0
+    while len(shelves) < -(-len(found) // 6) and time.monotonic() < deadline:
+        time.sleep(0.05)
+        shelves = [one for one in pushed if one[0]["kind"] == "shelf"]
+    header, (strip,) = shelves[-1]
+    assert (header["view"], header["query"]) == ("a", "old brass")
+    image = np.asarray(Image.open(io.BytesIO(strip)))
+    side = header["side"]
+    assert image.shape == (side, side * len(found), 3)
+    for i in range(len(found)):  # a lit sphere of a yellow metal
+        middle = image[15:25, side * i + 15 : side * i + 25].reshape(-1, 3).mean(axis=0)
+        assert middle[0] > 60
+        assert middle[0] > middle[2]
+    # the next time nothing is left to draw
+    again = ask(session, shelf={"query": "old brass"})
+    assert next(b for h, b in again if h["kind"] == "shelf") == [strip]
+
+
+@pytest.mark.parametrize(
+    ("shelf", "said"),
+    [
+        ({"query": "shiny > high"}, "expected terms"), ({"query": 7}, "expected a query"),
+        ({"query": "x" * 201}, "expected a query"), ("brass", "expected a query"),
+        ({"query": "shinny > 1"}, "did you mean 'shiny'"),
+    ],
+)  # fmt: skip
+def test_bad_queries_are_told(session, shelf, said):
+    replies = ask(session, shelf=shelf)
+    assert said in errors(replies)[0]
+    assert not [header for header, _ in replies if header["kind"] == "shelf"]
+
+
+def test_a_material_without_a_part_goes_to_the_chosen_one(session):
+    x, y = along(session, "handle")[0]
+    ask(session, pick=[x, y], assign={"material": "gold-satin"})
+    assert session.edit.material("handle").name == "gold-satin"
+    assert session.edit.material("body").name != "gold-satin"
+
+
+def test_all_traits_are_in_groups_and_own_ones_last(session):
+    reply = frame(session.handle({"kind": "hello", "view": "a", "seq": 1}))
+    names = [name for _, group in reply["groups"] for name in group]
+    assert sorted(names) == sorted(session.edit.traits.names)
+    mine = tb.Trait.from_labels("mine", ["blue-plastic", "red-rubber"], [1, -1])
+    session.edit.traits = session.edit.traits.with_trait(mine)
+    reply = frame(ask(session))  # the lists have changed, and come unasked
+    assert reply["groups"][-1] == ("yours", ["mine"])
+    assert "groups" not in frame(ask(session))
+
+
+def test_numbers_of_the_history_are_short(session):
+    ask(session, slide={"part": "lid", "amounts": {"shiny": 0.1 + 0.2}, "done": True})
+    ask(session)
+    last = frame(ask(session))["state"]["history"][-1]
+    assert "0.3" in last
+    assert "0.30000000000000004" not in last
+
+
+def test_a_deleted_folder_is_told_when_it_is_needed(prepared, tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    session = Session(over(prepared, cache=False))
+    try:
+        replies = ask(session, save="mine")
+        assert "the folder of designs was deleted" in errors(replies)[0]
+        assert frame(replies)["state"]["part"]
+    finally:
+        session.close()
+
+
 @pytest.fixture
 def client(session):
     with TestClient(application(session, "secret", {HOME}), base_url=HOME) as client:

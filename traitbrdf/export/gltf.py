@@ -40,11 +40,11 @@ _FILM_NM = (150.0, 300.0, 450.0, 600.0, 800.0)
 _PEAKS = np.array([5.4856e-13, 4.4201e-13, 5.2481e-13])  # of the CIE's curves as Gaussians
 _PLACES = np.array([1.6810e6, 1.7953e6, 2.2084e6])
 _WIDTHS = np.array([4.3278e9, 9.3046e9, 6.6121e9])
-_TO_REC709 = np.array([
+_REC709_OF_XYZ = np.array([  # from the left
     [3.2404542, -0.9692660, 0.0556434],
     [-1.5371385, 1.8760108, -0.2040259],
     [-0.4985314, 0.0415560, 1.0572252],
-]).T  # fmt: skip
+])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def _sensitivity(phase: Float64, turn: Float64) -> Float64:
     found = found * np.exp(-(phase**2) * _WIDTHS)
     second = math.sqrt(2.0 * math.pi * 4.5282e9) * np.cos(2.2399e6 * phase[:, 0] + turn[0])
     found[:, 0] += 9.7470e-14 * second * np.exp(-4.5282e9 * phase[:, 0] ** 2)
-    return np.asarray(found / 1.0685e-7 @ _TO_REC709.T)
+    return np.asarray(found / 1.0685e-7 @ _REC709_OF_XYZ)
 
 
 def _roughness(value: float) -> float:

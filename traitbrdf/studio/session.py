@@ -68,7 +68,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -90,6 +90,7 @@ from traitbrdf.studio.shelf import SIDE, Shelf
 Header = dict[str, Any]
 Reply = tuple[Header, list[bytes]]
 Push = Callable[[Header, list[bytes]], None]
+T = TypeVar("T")
 
 LARGEST = 1 << 20
 """Size of the largest message that is accepted, in bytes."""
@@ -333,10 +334,7 @@ class Session:
             reply["traits"] = list(edit.traits.names)
             reply["groups"] = _grouped(edit.traits.names)
             reply["library"] = list(edit.library.names)
-            self._listed.pop(view, None)
-            self._listed[view] = listed
-            while len(self._listed) > _VIEWS:
-                self._listed.pop(next(iter(self._listed)))
+            _keep(self._listed, view, listed)
         self._dragging = dragging
         # what is prepared, or made exact, is shown when it is there: nobody waits
         if not self._dragging and (not ready or (rest and edit.unfinished)):
@@ -564,12 +562,12 @@ class Session:
         self.edit.assign(self._part if part is None else str(part), str(assign.get("material")))
 
     def _browse(self, view: str, shelf: object) -> None:
-        """Look for library materials; `_show_shelf` answers."""
+        """Look for library materials; `_shelf_of` has the answer."""
         query = shelf.get("query") if isinstance(shelf, Mapping) else None
         if not isinstance(query, str) or len(query) > 200:
             raise ValueError(f"expected a query of up to 200 letters, got {query!r}")
         names = find_materials(query, self.edit.library, self.edit.traits)
-        self._wanted[view] = query, names[:_SHELF], len(names)
+        _keep(self._wanted, view, (query, names[:_SHELF], len(names)))
 
     def _shelf_of(self, view: str) -> Reply:
         query, names, total = self._wanted[view]
@@ -583,7 +581,8 @@ class Session:
         """Draw the spheres that views wait for, a few at a time, and tell of them."""
         with self._drawing:
             while not self._closed:
-                waiting = [(view, self._shelf.missing(w[1])) for view, w in self._wanted.items()]
+                with self._lock:
+                    waiting = [(v, self._shelf.missing(w[1])) for v, w in self._wanted.items()]
                 view, names = next(((v, n) for v, n in waiting if n), ("", []))
                 if not names:
                     return
@@ -634,6 +633,8 @@ class Session:
             raise ValueError(f"expected the name of a file, got {name!r}")
         if any(c in name for c in "/\\:\0") or len(name) > 100:
             raise ValueError(f"expected a name in {self.folder}, without a path, got {name!r}")
+        if self.folder is None or not self.folder.is_dir():
+            raise ValueError("the folder of designs was deleted: start anew in another one")
         return self.folder / (name if name.endswith(".tbr") else f"{name}.tbr")
 
     def _save(self, name: object) -> None:
@@ -642,7 +643,7 @@ class Session:
     def _open(self, name: object) -> None:
         path = self._file(name)
         if not path.is_file():
-            known = sorted(p.name for p in self.folder.glob("*.tbr"))
+            known = sorted(p.name for p in path.parent.glob("*.tbr"))
             raise ValueError(unknown_name("design", path.name, known))
         old = self.edit
         # the design has its own promise, and traits of one's own
@@ -699,10 +700,7 @@ class Session:
         self._expose(image)
         old = None if whole else self._sent.get(view)
         box = _difference(old, image) if old is not None else (0, height, 0, width)
-        self._sent.pop(view, None)
-        self._sent[view] = image
-        while len(self._sent) > _VIEWS:
-            self._sent.pop(next(iter(self._sent)))
+        _keep(self._sent, view, image)
         y0, y1, x0, x1 = box
         size = {"x": x0, "y": y0, "w": x1 - x0, "h": y1 - y0, "width": width, "height": height}
         if y0 >= y1:
@@ -789,12 +787,20 @@ class Session:
                     return
 
 
-def _here() -> Path:
-    """Return the working directory; one that was deleted is told of when a file is saved there."""
+def _keep(known: dict[str, T], view: str, value: T) -> None:
+    """Remember something of a view, and forget views that were not heard of for long."""
+    known.pop(view, None)
+    known[view] = value
+    while len(known) > _VIEWS:
+        known.pop(next(iter(known)))
+
+
+def _here() -> Path | None:
+    """Return the working directory, or None if it was deleted."""
     try:
         return Path.cwd()
     except FileNotFoundError:
-        return Path()
+        return None
 
 
 def _grouped(names: Sequence[str]) -> list[tuple[str, list[str]]]:
