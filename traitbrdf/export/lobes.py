@@ -46,6 +46,7 @@ _LIGHTS = 6
 _PIXELS = 60  # of each light
 _SIZE = 48
 _KEPT = 8  # images of a picture
+_DENSE = 400_000_000  # bytes of the rows of a picture that are kept, to be multiplied at once
 _STEPS = 64  # of each angle, for albedos
 _COSINES: Float64 = 1e-3 + (1.0 - 1e-3) * np.linspace(0.0, 1.0, 49) ** 2
 
@@ -239,12 +240,22 @@ class PicturePixels(Pixels):
 
     def images(self, tables: Float32) -> Float64:
         """Return the radiance (m, T) of scalar tables (grid.size, T) in light of one colour."""
+        if self._rows is not None:
+            rows = self._rows[:, self.colour]
+            return np.asarray(rows @ np.ascontiguousarray(tables), np.float64)
         key = hashlib.blake2b(np.ascontiguousarray(tables).tobytes()).digest()
         if key not in self._known:
             self._known[key] = self._operator.part_images(0, tables)
             if len(self._known) > _KEPT:
                 self._known.popitem(last=False)
         return self._known[key][:, self.colour].astype(np.float64)
+
+    @functools.cached_property
+    def _rows(self) -> Float32 | None:
+        """The rows (m, 3, cells) of all pixels, if they are few."""
+        if 12 * len(self.cosine) * self.grid.size > _DENSE:
+            return None
+        return self._operator.rows(np.arange(len(self.cosine)))
 
     @functools.cached_property
     def _mirrors(self) -> Float64:
