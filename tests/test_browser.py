@@ -436,6 +436,22 @@ def test_a_material_is_found_and_dropped_on_a_part(page, tmp_path):
         )
 
 
+def test_a_design_leaves_by_one_click(page, tmp_path):
+    with served(small(), tmp_path) as (_, address):
+        page.goto(address)
+        driver = Driver(page, None)
+        driver.settled()
+        page.get_by_role("button", name="export", exact=True).click()
+        driver.until("document.querySelector('.tb-told').textContent.startsWith('written')")
+        assert "error of a lit sphere" in page.locator(".tb-told").inner_text()
+        assert tb.load_mesh(tmp_path / "design.glb").parts == ("sphere",)
+        page.locator(".tb input[aria-label=file]").fill("../design")
+        page.get_by_role("button", name="export", exact=True).click()
+        driver.until(
+            "document.querySelector('[role=alert]').textContent.includes('without a path')"
+        )
+
+
 def test_a_design_of_another_shape_brings_its_parts(page, tmp_path):
     other = tb.Scene(tb.teapot(4), tb.EnvironmentMap.sky(rows=8), size=32)
     tb.EditSession(other, "preview", cache=False, error=1.0).save(tmp_path / "pot.tbr")

@@ -656,6 +656,18 @@ def test_an_export_can_be_cancelled(painted, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["pot.glb", "pot.mtlx", "pot.py"])
+def test_an_unwritable_target_is_told_before_the_work(painted, tmp_path, name):
+    def begun(stage, fraction):
+        pytest.fail("work began")
+
+    (tmp_path / name).mkdir()
+    with pytest.raises(IsADirectoryError, match=name):
+        painted.export(tmp_path / name, progress=begun)
+    with pytest.raises(FileNotFoundError, match="expected an existing folder"):
+        painted.export(tmp_path / "none" / name, progress=begun)
+
+
 def test_names_of_all_kinds_are_kept(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
     normals = np.broadcast_to((0.0, 0.0, 1.0), corners.shape)

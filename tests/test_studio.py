@@ -668,6 +668,48 @@ def test_all_traits_are_in_groups_and_own_ones_last(session):
     assert "groups" not in frame(ask(session))
 
 
+def told(session, request, seconds=120.0, **more):
+    """What is told of an export."""
+    heard = []
+    end = session.subscribe(lambda header, _: heard.append(header))
+    replies = ask(session, export=request, **more)
+    assert not errors(replies), errors(replies)
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        done = [header for header in heard if header["kind"] == "told"]
+        if done:
+            end()
+            return done[0]
+        time.sleep(0.02)
+    raise AssertionError("never told")
+
+
+def test_files_for_other_programs_are_written_behind(session, tmp_path):
+    assert told(session, "mine.png")["message"] == "mine.png"
+    shown = np.asarray(Image.open(tmp_path / "mine.png"))
+    np.testing.assert_array_equal(shown, session.display(session.edit.render(exact=False)))
+    assert told(session, "lid.binary", part="lid")["done"]
+    assert (tmp_path / "lid.binary").stat().st_size == 34_992_012
+    assert told(session, "lid.npz", part="lid")["done"]
+    read = tb.TabulatedBRDF.read(tmp_path / "lid.npz")
+    np.testing.assert_array_equal(read.values, session.edit.brdf("lid").values)
+    scene = told(session, "mine.py")
+    assert scene["message"].startswith("mine.py, mine.npz")
+    assert (tmp_path / "mine.py").exists()
+    # one at a time, and one that fails is told of
+    (tmp_path / "no.glb").mkdir()
+    failed = told(session, "no.glb", view="b")
+    assert failed["done"] is False
+    assert failed["view"] == "b"
+    assert "export: " in failed["message"]
+
+
+@pytest.mark.parametrize("name", ["../x.glb", "", ".glb", "a/b.png", 3, None])
+def test_files_elsewhere_are_refused(session, tmp_path, name):
+    assert "export: expected" in errors(ask(session, export=name))[0]
+    assert not list(tmp_path.iterdir())
+
+
 def test_numbers_of_the_history_are_short(session):
     ask(session, slide={"part": "lid", "amounts": {"shiny": 0.1 + 0.2}, "done": True})
     ask(session)

@@ -23,7 +23,7 @@ from traitbrdf.export.mitsuba import MitsubaPart, write_mitsuba
 from traitbrdf.export.openpbr import OpenPBRTarget, write_mtlx
 from traitbrdf.export.pieces import Piece, Texels, pieces_of, unwrapped, write_obj
 from traitbrdf.formats.display import exposure_of, tone_map
-from traitbrdf.formats.files import as_path
+from traitbrdf.formats.files import as_path, writable
 from traitbrdf.formats.images import write_exr
 from traitbrdf.reflectance.brdf import TabulatedBRDF
 from traitbrdf.scene.lights import EnvironmentMap
@@ -141,6 +141,8 @@ def export_design(
     ------
     ValueError
         On another ending or size; nothing is written then.
+    FileNotFoundError, IsADirectoryError, PermissionError
+        If the file could not be written; before any fit.
     TypeError
         If the shape is neither a sphere nor a mesh.
     RuntimeError
@@ -153,6 +155,7 @@ def export_design(
     size = whole(texture_size, "texture_size", 16)
     if size > _LARGEST:
         raise ValueError(f"texture_size: expected up to {_LARGEST} texels, got {texture_size!r}")
+    writable(target)  # fits take long
     shown = _Shown(scene, document, embedding, size, progress or _silent)
     return kinds[target.suffix](target, shown)
 

@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 PathName = str | PathLike[str]
 
 
+_DENIED = "not allowed to write there"
+
+
 class FormatError(ValueError):
     """A file exists, but its content is not what was expected.
 
@@ -54,6 +57,29 @@ def stem(path: PathName) -> str:
     return Path(path).stem
 
 
+def writable(path: PathName) -> Path:
+    """Return where a file ends up, links followed, or raise what `atomic_path` would.
+
+    Ask before long work whose result is written.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    FileNotFoundError, IsADirectoryError, PermissionError
+    """
+    target = Path(os.path.realpath(as_path(path)))
+    if target.is_dir():
+        raise IsADirectoryError(f"{path}: expected the path of a file to write, got a folder")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{path}: expected an existing folder, got {target.parent}")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise PermissionError(f"{path}: {_DENIED}")
+    return target
+
+
 @contextlib.contextmanager
 def atomic_path(path: PathName) -> Iterator[Path]:
     """Write a file completely or not at all.
@@ -77,11 +103,7 @@ def atomic_path(path: PathName) -> Iterator[Path]:
     PermissionError
         If it may not be written.
     """
-    target = Path(os.path.realpath(as_path(path)))
-    if target.is_dir():
-        raise IsADirectoryError(f"{path}: expected the path of a file to write, got a folder")
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{path}: expected an existing folder, got {target.parent}")
+    target = writable(path)
     if target.exists() and not target.is_file():  # a device or a pipe stays what it is
         with tempfile.TemporaryDirectory() as folder:
             whole = Path(folder) / f"whole{target.suffix}"
@@ -89,16 +111,13 @@ def atomic_path(path: PathName) -> Iterator[Path]:
             with whole.open("rb") as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink)
         return
-    denied = PermissionError(f"{path}: not allowed to write there")
-    if not os.access(target if target.exists() else target.parent, os.W_OK):
-        raise denied
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp{target.suffix}"
     try:
         try:
             yield temporary
         except PermissionError as error:
             if temporary.name in str(error.filename or ""):
-                raise denied from error
+                raise PermissionError(f"{path}: {_DENIED}") from error
             raise
         if not temporary.exists():
             raise FileNotFoundError(f"{path}: nothing was written to {temporary}")

@@ -173,6 +173,16 @@ class Canvas {
     this.exact = make("button", { textContent: "exact", disabled: true,
       title: "render without the basis what it cannot promise: takes seconds",
       onclick: () => this.link.ask({ exact: true, rest: true }, false) });
+    this.kind = make("select", { ariaLabel: "export as",
+      title: "glb, mtlx, py: the design; png: the picture; binary, bsdf, npz: the chosen material" },
+      ...["glb", "mtlx", "py", "png", "binary", "bsdf", "npz"].map((name) => make("option", {
+        value: name, textContent: `.${name}` })));
+    const send = make("button", { textContent: "export", title: "for other programs",
+      onclick: () => {
+        this.told.textContent = "writing ...";
+        this.change({ export: `${this.name.value}.${this.kind.value}` }, false);
+      } });
+    this.told = make("div", { className: "tb-told", role: "status" });
     this.theme = make("button", { title: "what is around the picture",
       onclick: () => this.surround(this.root.dataset.theme === "light" ? "dark" : "light") });
     this.wide = make("button", { textContent: "full screen", title: "F: full screen, and back",
@@ -209,7 +219,7 @@ class Canvas {
       make("label", { title: "a stroke paints only the part on which it begins" },
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
-      row(this.theme, this.wide),
+      row(this.kind, send, this.theme, this.wide), this.told,
       this.layers, make("div", { className: "tb-row", style: "flex-wrap: wrap" }, ...this.tied),
       this.sliders, this.status, this.said, this.history);
     this.choose();
@@ -564,8 +574,13 @@ class Canvas {
     } else if (header.kind === "changed") this.others(header);
     else if (header.view !== this.view) return;
     else if (header.kind === "shelf") this.stock(header, buffers[0]);
+    else if (header.kind === "told") {
+      this.told.textContent = header.done ? `written: ${header.message}` : "";
+      if (!header.done) this.said.textContent = header.message;
+    }
     else if (header.kind === "error") {
       this.said.textContent = header.message;
+      this.told.textContent = "";
       if (header.seq !== null) this.link.answered(header);
     } else if (header.kind === "frame") {
       if (header.socket && !this.socket) this.connect(header.socket);

@@ -39,7 +39,7 @@ export class Link {
   #fits(old, fresh) {
     // a stroke, a slider and a command are obeyed one after the other
     const kinds = ["brush", "slide", "layer", "assign", "do", "save", "open", "pick", "hello",
-      "shelf"];
+      "shelf", "export"];
     const had = kinds.filter((kind) => kind in old);
     const has = kinds.filter((kind) => kind in fresh);
     if (!had.length || !has.length) return !("hello" in old || "hello" in fresh);

@@ -30,7 +30,9 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``shelf`` {query}: the library materials that a query describes (`find_materials`); the
       ``shelf`` message below is the answer. ``assign`` without a part means the chosen one
     - ``do``: "undo", "redo"
-    - ``save``, ``open``: names of design files in the session's folder
+    - ``save``, ``open``: names of design files in the session's folder; ``export``: the name of a
+      file there for other programs, of the design (.glb, .mtlx, .py), the frame (.png) or the
+      chosen part's material (.binary, .bsdf, .npz). It is written behind; ``told`` says when
     - ``before``: show the frame without any layer
     - ``exact``: render parts that the basis shows too inexactly without it, which takes seconds
     - ``rest``: the pointer rests: send the whole frame without loss
@@ -51,6 +53,8 @@ Down (session to page)
 ``{"kind": "shelf", "view", "query", "names", "total", "side"}``
     The first materials of ``total`` that a query describes, and in the buffer a JPEG of their
     spheres side by side. It comes once more when spheres that were not drawn yet are.
+``{"kind": "told", "view", "message", "done"}``
+    What became of an export; ``done`` is false if it failed.
 ``{"kind": "changed", "by", "ready", "fraction"}``
     Pushed to subscribers, at most ten times a second: a view (``by``; "" is several) or the
     preparation changed the picture. Other views ask for it by an empty input when they want it.
@@ -61,7 +65,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -77,14 +80,15 @@ from PIL import Image
 
 from traitbrdf.design.colours import Colour
 from traitbrdf.design.effects import Assign, Effect, Move
-from traitbrdf.design.layers import Layer
 from traitbrdf.design.strokes import Stroke
+from traitbrdf.export.files import SUFFIXES
 from traitbrdf.formats.display import Display, exposure_of
-from traitbrdf.formats.files import unknown_name
+from traitbrdf.formats.files import atomic_path, unknown_name
 from traitbrdf.scene.camera import Camera
 from traitbrdf.session.editing import EditSession
 from traitbrdf.space.search import find_materials
 from traitbrdf.space.traits import default_traits
+from traitbrdf.studio.lists import grouped, layer_told, shortened
 from traitbrdf.studio.shelf import SIDE, Shelf
 
 Header = dict[str, Any]
@@ -110,14 +114,7 @@ _POINTS = 4096
 _NEWS = 0.1
 """Seconds for which changes are collected before views are told."""
 _PADDED = 66_000
-_GROUPS: dict[str, tuple[str, ...]] = {
-    "look": ("shiny", "metallic", "rough", "dusty", "bright"),
-    "highlight": ("glossy", "matte", "strength", "sharpness", "tint", "specular"),
-    "touch": ("soft", "hard", "greasy", "diffuse"),
-    "made of": ("silver", "gold", "plastic", "acrylic", "ceramic", "rubber", "fabric"),
-    "colour": ("red", "green", "blue"),
-}
-"""What traits are about; the first group is the one that is needed most."""
+_MATERIALS = (".binary", ".bsdf", ".npz")
 _SETTINGS = {"opacity", "visible", "name"}
 """Settings of layers that a page may change."""
 _CHANGES = {
@@ -204,6 +201,7 @@ class Session:
         self._sent: dict[str, NDArray[np.float32]] = {}
         self._shelf = Shelf(edit.library)
         self._drawing = threading.Lock()
+        self._exporting: threading.Thread | None = None
         self._wanted: dict[str, tuple[str, list[str], int]] = {}
         self._listed: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {}
         self._stroke: Stroke | None = None
@@ -278,9 +276,10 @@ class Session:
             if self._telling is not None:
                 self._telling.cancel()
         self.edit.cancel()
-        refiner = self.refiner  # it may end meanwhile, and says so by None
-        if refiner is not None:
-            refiner.join(10.0)
+        # they may end meanwhile, and say so by None
+        for thread in (self.refiner, self._exporting):
+            if thread is not None:
+                thread.join(10.0)
 
     def still(self) -> bytes:
         """Return the present frame as PNG; a draft if the view is not prepared."""
@@ -332,7 +331,7 @@ class Session:
         if kind == "hello" or self._listed.get(view, listed) != listed:
             reply["parts"] = list(edit.scene.parts)
             reply["traits"] = list(edit.traits.names)
-            reply["groups"] = _grouped(edit.traits.names)
+            reply["groups"] = grouped(edit.traits.names)
             reply["library"] = list(edit.library.names)
             _keep(self._listed, view, listed)
         self._dragging = dragging
@@ -372,6 +371,7 @@ class Session:
             ("do", self._do),
             ("save", self._save),
             ("open", self._open),
+            ("export", lambda name: self._export(view, name)),
         ):
             if key in header:
                 try:
@@ -588,10 +588,8 @@ class Session:
                     return
                 self._shelf.draw(names[:_AT_ONCE])
                 with self._lock:
-                    pushes, news = list(self.subscribers.values()), self._shelf_of(view)
-                for push in pushes:
-                    with contextlib.suppress(Exception):  # the view is gone
-                        push(dict(news[0]), list(news[1]))
+                    news = self._shelf_of(view)
+                self._push(*news)
 
     def _look(self, header: Mapping[str, Any]) -> None:
         camera = self.edit.scene.camera
@@ -627,18 +625,49 @@ class Session:
         else:
             self.edit.redo()
 
-    def _file(self, name: object) -> Path:
-        """Return the file of a design; a page can name no other folder."""
+    def _file(self, name: object, suffixes: Sequence[str] = (".tbr",)) -> Path:
+        """Return a file, of the first ending if it has none; a page can name no other folder."""
         if not isinstance(name, str) or not name or name.startswith("."):
             raise ValueError(f"expected the name of a file, got {name!r}")
         if any(c in name for c in "/\\:\0") or len(name) > 100:
             raise ValueError(f"expected a name in {self.folder}, without a path, got {name!r}")
         if self.folder is None or not self.folder.is_dir():
             raise ValueError("the folder of designs was deleted: start anew in another one")
-        return self.folder / (name if name.endswith(".tbr") else f"{name}.tbr")
+        return self.folder / (name if name.endswith(tuple(suffixes)) else name + suffixes[0])
 
     def _save(self, name: object) -> None:
         self.edit.save(self._file(name))
+
+    def _export(self, view: str, name: object) -> None:
+        """Write a file for another program behind, and tell when it is there."""
+        path = self._file(name, (*SUFFIXES, ".png", *_MATERIALS))
+        if self._exporting is not None and self._exporting.is_alive():
+            raise ValueError("expected one export at a time: another is being written")
+        edit, part = self.edit, self._part
+
+        def go_on(_stage: str, _fraction: float) -> None:
+            if self._closed:
+                raise CancelledError
+
+        def write() -> None:
+            message, done = path.name, True
+            try:
+                if path.suffix == ".png":
+                    still = self.still()
+                    with atomic_path(path) as temporary:
+                        temporary.write_bytes(still)
+                elif path.suffix in _MATERIALS:
+                    edit.brdf(part).write(path)
+                else:
+                    message = str(edit.export(path, progress=go_on))
+            except CancelledError:
+                return
+            except Exception as error:
+                message, done = f"export: {error}"[:500], False
+            self._push({"kind": "told", "view": view, "message": message, "done": done}, [])
+
+        self._exporting = threading.Thread(target=write, name="traitbrdf-export", daemon=True)
+        self._exporting.start()
 
     def _open(self, name: object) -> None:
         path = self._file(name)
@@ -667,8 +696,8 @@ class Session:
             known = edit.history
             told = {
                 "edits": len(edit.layers),
-                "history": [_shortened(line) for line in known[-6:]],
-                "layers": [_layer_told(layer.layer) for layer in edit.layers],
+                "history": [shortened(line) for line in known[-6:]],
+                "layers": [layer_told(layer.layer) for layer in edit.layers],
             }
         return {
             "part": self._part,
@@ -734,12 +763,16 @@ class Session:
                 "kind": "changed", "by": self._teller, "ready": self.edit.ready,
                 "fraction": round(self._fraction, 3),
             }  # fmt: skip
+        self._push(news, [])
+
+    def _push(self, header: Header, buffers: list[bytes]) -> None:
+        """Tell all subscribers something that they have not asked for."""
+        with self._lock:
             pushes = list(self.subscribers.values())
         for push in pushes:
-            try:
-                push(dict(news), [])
-            except Exception:  # the view is gone: its transport ends the subscription
-                continue
+            # a view that is gone: its transport ends the subscription
+            with contextlib.suppress(Exception):
+                push(dict(header), list(buffers))
 
     def _refine(self) -> None:
         """Prepare the view in the background, and tell subscribers of its progress."""
@@ -801,36 +834,6 @@ def _here() -> Path | None:
         return Path.cwd()
     except FileNotFoundError:
         return None
-
-
-def _grouped(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Return titles and traits of the groups, those that no group knows last."""
-    known = {name for group in _GROUPS.values() for name in group}
-    groups = [(title, [n for n in group if n in names]) for title, group in _GROUPS.items()]
-    groups.append(("yours", [name for name in names if name not in known]))
-    return [(title, group) for title, group in groups if group]
-
-
-def _layer_told(layer: Layer) -> Header:
-    """Return what a list of layers shows of one."""
-    return {
-        "name": layer.name, "effect": _shortened(repr(layer.effect)),
-        "parts": ", ".join(layer.mask.parts) or "nothing", "opacity": layer.opacity,
-        "visible": layer.visible, "local": layer.local,
-    }  # fmt: skip
-
-
-def _shortened(line: str) -> str:
-    """Shorten a line of the history: long strokes are told by their number of points.
-
-    Numbers are rounded to four digits.
-    """
-    line = re.sub(r"\d+\.\d{5,}(e[-+]?\d+)?", lambda found: f"{float(found[0]):.4g}", line)
-    start, _, rest = line.partition("Stroke([")
-    points, close, end = rest.partition("], trait=")
-    if not close or points.count("(") <= 2:
-        return line if len(line) < 160 else f"{line[:150]} ..."
-    return f"{start}Stroke(<{points.count('(')} points>, trait={end}"
 
 
 def _numbers(values: object, count: int) -> list[float]:
