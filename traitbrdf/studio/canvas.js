@@ -179,10 +179,10 @@ class Canvas {
         value: name, textContent: `.${name}` })));
     const send = make("button", { textContent: "export", title: "for other programs",
       onclick: () => {
-        this.told.textContent = "writing ...";
+        this.news.textContent = "writing ...";
         this.change({ export: `${this.name.value}.${this.kind.value}` }, false);
       } });
-    this.told = make("div", { className: "tb-told", role: "status" });
+    this.news = make("div", { className: "tb-told", role: "status" });
     this.theme = make("button", { title: "what is around the picture",
       onclick: () => this.surround(this.root.dataset.theme === "light" ? "dark" : "light") });
     this.wide = make("button", { textContent: "full screen", title: "F: full screen, and back",
@@ -219,7 +219,7 @@ class Canvas {
       make("label", { title: "a stroke paints only the part on which it begins" },
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
-      row(this.kind, send, this.theme, this.wide), this.told,
+      row(this.kind, send, this.theme, this.wide), this.news,
       this.layers, make("div", { className: "tb-row", style: "flex-wrap: wrap" }, ...this.tied),
       this.sliders, this.status, this.said, this.history);
     this.choose();
@@ -575,12 +575,12 @@ class Canvas {
     else if (header.view !== this.view) return;
     else if (header.kind === "shelf") this.stock(header, buffers[0]);
     else if (header.kind === "told") {
-      this.told.textContent = header.done ? `written: ${header.message}` : "";
+      this.news.textContent = header.done ? `written: ${header.message}` : "";
       if (!header.done) this.said.textContent = header.message;
     }
     else if (header.kind === "error") {
       this.said.textContent = header.message;
-      this.told.textContent = "";
+      this.news.textContent = "";
       if (header.seq !== null) this.link.answered(header);
     } else if (header.kind === "frame") {
       if (header.socket && !this.socket) this.connect(header.socket);
