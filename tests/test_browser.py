@@ -445,7 +445,7 @@ def test_a_design_leaves_by_one_click(page, tmp_path):
         driver.until("document.querySelector('.tb-told').textContent.startsWith('written')")
         assert "error of a lit sphere" in page.locator(".tb-told").inner_text()
         assert tb.load_mesh(tmp_path / "design.glb").parts == ("sphere",)
-        page.locator(".tb input[aria-label=file]").fill("../design")
+        page.locator(".tb input[aria-label=file]").fill("elsewhere/design")
         page.get_by_role("button", name="export", exact=True).click()
         driver.until(
             "document.querySelector('[role=alert]').textContent.includes('without a path')"
