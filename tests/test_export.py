@@ -14,6 +14,7 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pygltflib
 import pytest
 import trimesh
 from chrome import CHROMIUM, FLAGS
@@ -291,6 +292,28 @@ def test_glb_has_the_geometry(painted, files):
     assert len(ours.faces) == len(shape.faces)
     assert np.allclose(ours.center, shape.center, atol=1e-5)
     assert ours.radius == pytest.approx(shape.radius, rel=1e-5)
+
+
+def test_glb_opens_in_another_loader(painted, files):
+    read = pygltflib.GLTF2().load(str(files["glb"].files[0]))
+    blob, total = read.binary_blob(), 0.0
+
+    def array(index, kind, width):
+        one = read.accessors[index]
+        start = read.bufferViews[one.bufferView].byteOffset + (one.byteOffset or 0)
+        return np.frombuffer(blob, kind, one.count * width, start).reshape(-1, width)
+
+    for mesh in read.meshes:
+        (only,) = mesh.primitives
+        points = array(only.attributes.POSITION, "<f4", 3)
+        points = points[array(only.indices, "<u4", 1).reshape(-1, 3)]
+        sides = points[:, 1:].astype(float) - points[:, :1]
+        total += 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum()
+        assert read.materials[only.material].name == mesh.name
+    assert tuple(mesh.name for mesh in read.meshes) == painted.scene.shape.parts
+    shape = painted.scene.shape
+    area = trimesh.Trimesh(shape.vertices, shape.faces).area
+    assert total == pytest.approx(area, rel=1e-5)
 
 
 def test_glb_says_camera_and_lights(painted, files):

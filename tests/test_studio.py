@@ -606,6 +606,17 @@ def test_a_display_shows_what_the_tone_map_does():
 HOME = "http://127.0.0.1:80"
 
 
+def test_a_fast_stroke_stays_on_the_part_on_which_it_begins(session):
+    """All of a stroke may come in one message, and its end lie on another part."""
+    image, parts = session.edit.scene.part_image, session.edit.scene.parts
+    body, handle = parts.index("body"), parts.index("handle")
+    rows, columns = np.nonzero((image[:, :-1] == handle) & (image[:, 1:] == body))
+    y, x = rows[0] + 0.5, columns[0] + 0.5
+    for points, part in (([(x, y), (x + 1, y)], "handle"), ([(x + 1, y), (x, y)], "body")):
+        assert not errors(ask(session, [samples(points)], brush={**BRUSH, "radius": 4.0}))
+        assert f"only='{part}'" in session.edit.history[-1]
+
+
 # -- materials to choose from, and lists ----------------------------------------------------------
 
 

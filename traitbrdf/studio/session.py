@@ -389,12 +389,16 @@ class Session:
         self._part = part
 
     def _pick(self, place: object) -> None:
-        x, y = (math.floor(v) for v in _numbers(place, 2))
+        found = self._under(_numbers(place, 2))
+        if found >= 0:
+            self._part = self.edit.scene.parts[found]
+
+    def _under(self, place: Sequence[float]) -> int:
+        """Return the index of the part at a place (x, y) of the image; -1 for none."""
+        x, y = (math.floor(v) for v in place)
         scene = self.edit.scene
-        if 0 <= x < scene.width and 0 <= y < scene.height:
-            found = int(scene.part_image[y, x])
-            if found >= 0:
-                self._part = scene.parts[found]
+        inside = 0 <= x < scene.width and 0 <= y < scene.height
+        return int(scene.part_image[y, x]) if inside else -1
 
     def _paint(self, view: str, brush: object, buffers: Sequence[Any]) -> None:
         if not isinstance(brush, Mapping):
@@ -457,11 +461,9 @@ class Session:
         parts = parts[parts >= 0]
         if not len(parts):
             return
-        if stay and self._only is None:  # the part under the pen, or under most of the brush
-            x, y = (math.floor(v) for v in stroke.points[-1])
-            inside = 0 <= x < scene.width and 0 <= y < scene.height
-            under = int(scene.part_image[y, x]) if inside else -1
-            self._only = scene.parts[under if under >= 0 else int(np.bincount(parts).argmax())]
+        if stay and self._only is None:  # the part it begins on, or under most of the brush
+            begun = (found for found in map(self._under, stroke.points) if found >= 0)
+            self._only = scene.parts[next(begun, int(np.bincount(parts).argmax()))]
         self.edit.paint(stroke, only=self._only)
         self._mine = self.edit.design
         self._part = self._only or self._part
