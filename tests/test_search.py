@@ -23,7 +23,8 @@ def test_bounds_of_traits(trait, bound, sign):
     found = tb.find_materials(f"{trait} {sign} {bound:.3f}")
     scores = scores_of(found, trait)
     bound = float(f"{bound:.3f}")
-    assert (scores > bound - 1e-6 if ">" in sign else scores < bound + 1e-6).all()
+    assert {">": scores > bound, "<": scores < bound,
+            ">=": scores >= bound, "<=": scores <= bound}[sign].all()  # fmt: skip
     # the best ones first, and the others are all that is left
     assert (np.diff(scores if ">" in sign else -scores) <= 1e-9).all()
     other = tb.find_materials(f"not {trait} {sign} {bound:.3f}")

@@ -97,8 +97,8 @@ def _found(term: str, names: list[str], scores: NDArray[np.float64], traits: Tra
             raise ValueError(f"query: {unknown_name('trait', name, traits.names)}")
         bound, above = float(parsed["number"]), parsed["sign"][0] == ">"
         held = score > bound if above else score < bound
-        if len(parsed["sign"]) > 1:
-            held |= np.isclose(score, bound)
+        if parsed["sign"].endswith("="):
+            held |= score == bound
         fit = score if above else -score
     else:
         held, fit = np.ones(len(names), bool), np.zeros(len(names))
