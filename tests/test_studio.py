@@ -661,11 +661,16 @@ def test_bad_queries_are_told(session, shelf, said):
     assert not [header for header, _ in replies if header["kind"] == "shelf"]
 
 
-def test_a_material_without_a_part_goes_to_the_chosen_one(session):
+def test_a_material_goes_to_the_part_at_a_place(session):
     x, y = along(session, "handle")[0]
-    ask(session, pick=[x, y], assign={"material": "gold-satin"})
+    replies = ask(session, assign={"at": [x, y], "material": "gold-satin"})
+    assert frame(replies)["state"]["part"] == "handle"
     assert session.edit.material("handle").name == "gold-satin"
     assert session.edit.material("body").name != "gold-satin"
+    # what is dropped beside the object goes nowhere
+    count = len(session.edit.layers)
+    assert "beside it" in errors(ask(session, assign={"at": [0, 0], "material": "chrome"}))[0]
+    assert len(session.edit.layers) == count
 
 
 def test_all_traits_are_in_groups_and_own_ones_last(session):

@@ -123,6 +123,7 @@ class Canvas {
     clearInterval(this.clock);
     clearTimeout(this.resting);
     clearTimeout(this.telling);
+    clearTimeout(this.finding);
     this.model.off("msg:custom", this.listener);
     this.socket?.close();
     for (const undo of this.undoing) undo();
@@ -379,9 +380,7 @@ class Canvas {
     on(this.picture, "drop", (event) => {
       event.preventDefault();
       const material = event.dataTransfer.getData("text/plain");
-      if (!material) return;
-      this.change({ pick: this.place(event) }, false);
-      this.change({ assign: { material } }, false); // of the part that was picked
+      if (material) this.change({ assign: { at: this.place(event), material } }, false);
     });
     on(this.picture, "wheel", (event) => {
       event.preventDefault();

@@ -23,12 +23,12 @@ Up (page to session). All keys but ``kind`` and ``view`` may be missing.
     - ``layer`` {index, do} with "delete", "duplicate", "up", "down", "clear" or "invert", or
       {index, set {opacity, visible, name}, done}
     - ``slide`` {part, amounts {trait: change since the slider was taken}, done}
-    - ``assign`` {part, material}
+    - ``assign`` {part, material}, or {at [x, y], material} for the part at a pixel
     - ``orbit`` [degrees right, degrees up], ``zoom`` factor, ``turn`` degrees of the map;
       ``dragging`` says that more of these follow at once: they get glances, and preparation waits
       for the end of the drag
     - ``shelf`` {query}: the library materials that a query describes (`find_materials`); the
-      ``shelf`` message below is the answer. ``assign`` without a part means the chosen one
+      ``shelf`` message below is the answer
     - ``do``: "undo", "redo"
     - ``save``, ``open``: names of design files in the session's folder; ``export``: the name of a
       file there for other programs, of the design (.glb, .mtlx, .py), the frame (.png) or the
@@ -561,7 +561,12 @@ class Session:
         if not isinstance(assign, Mapping):
             raise TypeError(f"expected an object, got {assign!r}")
         part = assign.get("part")
-        self.edit.assign(self._part if part is None else str(part), str(assign.get("material")))
+        if "at" in assign:
+            found = self._under(_numbers(assign["at"], 2))
+            if found < 0:
+                raise ValueError("expected a place on the object, got one beside it")
+            self._part = part = self.edit.scene.parts[found]
+        self.edit.assign(str(part), str(assign.get("material")))
 
     def _browse(self, view: str, shelf: object) -> None:
         """Look for library materials; `_shelf_of` has the answer."""
@@ -590,8 +595,9 @@ class Session:
                     return
                 self._shelf.draw(names[:_AT_ONCE])
                 with self._lock:
-                    news = self._shelf_of(view)
-                self._push(*news)
+                    news = self._shelf_of(view) if view in self._wanted else None
+                if news is not None:
+                    self._push(*news)
 
     def _look(self, header: Mapping[str, Any]) -> None:
         camera = self.edit.scene.camera
