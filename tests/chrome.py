@@ -18,6 +18,9 @@ import nbformat
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--force-device-scale-factor=1"]
 """A root user has no sandbox; the rest makes pictures repeatable."""
+WEBGL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WEBGL += [flag for flag in FLAGS if flag != "--disable-gpu"]
+"""The same, with WebGL on the CPU."""
 
 
 def free_port() -> int:

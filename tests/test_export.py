@@ -17,7 +17,7 @@ import numpy as np
 import pygltflib
 import pytest
 import trimesh
-from chrome import CHROMIUM, FLAGS
+from chrome import CHROMIUM, WEBGL
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -473,10 +473,8 @@ def shown_by_three(tmp_path):
     handler = functools.partial(Quiet, directory=str(tmp_path))
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    flags = [*FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags.remove("--disable-gpu")
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=WEBGL)
         page = browser.new_page()
 
         def show(address):

@@ -6,10 +6,10 @@ import importlib
 
 import numpy as np
 import pytest
-from chrome import CHROMIUM, FLAGS
+from chrome import CHROMIUM, WEBGL
 
 import traitbrdf as tb
-from traitbrdf.export.lobes import ANGLES, Pixels
+from traitbrdf.export.lobes import Pixels, near_angles
 from traitbrdf.reflectance.models import ggx_lobe
 
 SIZE = 64
@@ -115,7 +115,7 @@ class Lit(Pixels):
             half = lamp + self.views
             half /= np.linalg.norm(half, axis=1, keepdims=True)
             cosine = (half * lamp).sum(1)
-            near = np.stack([np.interp(cosine, ANGLES, one) for one in np.eye(len(ANGLES))], axis=1)
+            near = near_angles(cosine)
             lobe = ggx_lobe(lamp, self.views, alpha) * np.maximum(lamp[:, 2], 0.0)
             found = found + lobe[:, None] * near
         return found
@@ -164,10 +164,8 @@ def test_generated_code_shows_the_material(tmp_path):
     grid = tb.default_embedding().grid_
     lit = Lit(grid, sphere)
     edit = tb.EditSession(tb.Scene(tb.sphere(), size=8))
-    flags = [*FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags.remove("--disable-gpu")
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=WEBGL)
         page = browser.new_page()
         for name in (
             "red-rubber",

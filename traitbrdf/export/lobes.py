@@ -115,8 +115,7 @@ class Pixels(ABC):
     @functools.cached_property
     def _near(self) -> Float64:
         """How much (cells, angles) of a cell belongs to each of the angles."""
-        cosine = np.sqrt(0.5 * (1.0 + (self._wi * self._wo).sum(axis=-1))).ravel()
-        return np.stack([np.interp(cosine, ANGLES, one) for one in np.eye(len(ANGLES))], axis=1)
+        return near_angles(np.sqrt(0.5 * (1.0 + (self._wi * self._wo).sum(axis=-1))).ravel())
 
 
 class FittingPixels(Pixels):
@@ -281,6 +280,19 @@ class PicturePixels(Pixels):
         return whole.reshape(side, side, 3)
 
 
+def near_angles(cosine: Float64) -> Float64:
+    """Return how much (m, angles) of each of `ANGLES` cosines (m,) of the angle of difference are.
+
+    Times values at these angles, that is their linear interpolation.
+    """
+    place = np.interp(cosine, ANGLES, np.arange(len(ANGLES)))
+    low = np.minimum(place.astype(np.int64), len(ANGLES) - 2)
+    share, row = place - low, np.arange(len(place))
+    found = np.zeros((len(place), len(ANGLES)))
+    found[row, low], found[row, low + 1] = 1.0 - share, share
+    return found
+
+
 def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
     """Return directional albedos (m, angles) of a GGX lobe, told apart by `ANGLES`.
 
@@ -294,7 +306,7 @@ def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
     slope = alpha * np.sqrt(u / (1.0 - u))
     sine, up = slope / np.sqrt(1.0 + slope**2), 1.0 / np.sqrt(1.0 + slope**2)
     h = np.stack([sine * np.cos(turn), sine * np.sin(turn), up], axis=-1)
-    found = np.zeros((len(cosine), len(ANGLES)))
+    found = np.empty((len(cosine), len(ANGLES)))
     for i, c in enumerate(cosine):
         wo = np.array([math.sqrt(max(1.0 - c * c, 0.0)), 0.0, c])
         along = np.maximum(h @ wo, 0.0)
@@ -305,11 +317,7 @@ def ggx_albedo(cosine: Float64, alpha: float) -> Float64:
             low * np.sqrt(a2 + (1.0 - a2) * c * c) + c * np.sqrt(a2 + (1.0 - a2) * low * low)
         )  # fmt: skip
         weight = np.where(z > 0.0, g * along / (h[:, 2] * c), 0.0)
-        place = np.interp(along, ANGLES, np.arange(len(ANGLES)))
-        low = np.minimum(place.astype(np.int64), len(ANGLES) - 2)
-        share = place - low
-        for node, part_of in ((low, 1.0 - share), (low + 1, share)):
-            found[i] += np.bincount(node, weight * part_of, len(ANGLES)) / len(weight)
+        found[i] = weight @ near_angles(along) / len(weight)
     return found
 
 
