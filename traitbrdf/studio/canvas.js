@@ -220,7 +220,7 @@ class Canvas {
       make("label", { title: "a stroke paints only the part on which it begins" },
         this.stay, " stay on one part"),
       row(this.undo, this.redo, this.compare, this.exact), row(this.name, save, open),
-      row(this.kind, send, this.theme, this.wide), this.news,
+      row(this.kind, send), this.news, row(this.theme, this.wide),
       this.layers, make("div", { className: "tb-row", style: "flex-wrap: wrap" }, ...this.tied),
       this.sliders, this.status, this.said, this.history);
     this.choose();

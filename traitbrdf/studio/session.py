@@ -589,15 +589,19 @@ class Session:
         with self._drawing:
             while not self._closed:
                 with self._lock:
-                    waiting = [(v, self._shelf.missing(w[1])) for v, w in self._wanted.items()]
-                view, names = next(((v, n) for v, n in waiting if n), ("", []))
-                if not names:
+                    waiting = [self._shelf.missing(names) for _, names, _ in self._wanted.values()]
+                drawn = next((names[:_AT_ONCE] for names in waiting if names), [])
+                if not drawn:
                     return
-                self._shelf.draw(names[:_AT_ONCE])
-                with self._lock:
-                    news = self._shelf_of(view) if view in self._wanted else None
-                if news is not None:
-                    self._push(*news)
+                self._shelf.draw(drawn)
+                with self._lock:  # several views may wait for the same spheres
+                    news = [
+                        self._shelf_of(view)
+                        for view, (_, names, _) in self._wanted.items()
+                        if not set(drawn).isdisjoint(names)
+                    ]
+                for one in news:
+                    self._push(*one)
 
     def _look(self, header: Mapping[str, Any]) -> None:
         camera = self.edit.scene.camera
